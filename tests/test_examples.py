@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import runpy
 
+import numpy as np
 import pytest
 
 from tests.examples import FOLDER
+from tests.figures import rendered
 from tests.runs import run_command
 from torch_qpmpc.experiment.run_folder import read_summary
 from torch_qpmpc.experiment.tasks import TASKS
@@ -30,3 +33,11 @@ def test_an_example_learns_for_two_updates(name, tmp_path):
     assert {*TASKS[name].rivals} <= {*summary["rivals"]}
     assert (tmp_path / "episode.png").exists()
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 200
+
+
+def test_the_figure_of_bad_hours_shows_what_prediction_and_observation_save():
+    drawn = runpy.run_path(str(FOLDER / "bad_hours.py"))
+    rendered(drawn["figure"]())
+    for loops in (drawn["dropout"](), drawn["transfer"]()):
+        better, worse = (np.square(rows[:, 0] - rows[:, 2]).sum() for rows in loops.values())
+        assert better < 0.8 * worse

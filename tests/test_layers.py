@@ -67,7 +67,7 @@ LAYERS = {
 BUDGET = {
     ".": 433,
     "analysis": 1203,
-    "control": 3711,
+    "control": 3892,
     "envs": 1525,
     "experiment": 4001,
     "export": 1412,

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.linalg
+import torch
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
@@ -150,14 +151,31 @@ def test_the_filter_is_stable_and_faster_with_more_drift():
     [
         (lambda c: c.step([0.0]), "r: got None in the first step, expected set-points of y1"),
         (lambda c: c.step([0.0, 1.0], [0.0]), r"y: got shape \(1, 2\), expected 1 numbers \(y1\)"),
-        (lambda c: c.step([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
+        (lambda c: c.reset([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
         (
-            lambda c: c.step([3.4e38], [0.0]),
+            lambda c: c.reset([3.4e38]),
             r"y: got 3\.4e\+38 of y1, expected at most 1e\+08 in size\. If it is no error, measure",
         ),
         (
-            lambda c: c.step([0.0], [-1e12]),
+            lambda c: c.simulate(None, 3, [-1e12]),
             r"r: got -1e\+12 of y1, expected at most 1e\+08 in size",
+        ),
+        (
+            lambda c: c.step(torch.zeros(1, requires_grad=True), [0.0]),
+            r"y: got a tensor that requires grad, expected one without. Pass y.deta",
+        ),
+        (
+            lambda c: c.step([0.0], torch.zeros(1, requires_grad=True)),
+            "r: got a tensor that requires grad, expected one without",
+        ),
+        (
+            lambda c: c.observe([0.0], {"valve": 1.0}),
+            r"u: got signals \['valve'\], expected the signals \['u1'\]",
+        ),
+        (lambda c: c.redesign(u_bounds=(1.0, -1.0)), "u_bounds: got lower 1 > upper -1 for u1"),
+        (
+            lambda _: qm.Controller(integrator(learn=("H", "q"))).redesign(Q=2.0),
+            "mpc: got an MPC that learns H, q, expected one whose theta is its design's. Change",
         ),
         (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
         (
@@ -204,7 +222,9 @@ def test_signals_may_be_as_large_as_bounds_noise_and_effects_make_usual():
     assert np.allclose(largest(**disturbed), [1e8, 1e11, 1e8, np.inf])
     controller = qm.Controller(qm.LinearMPC(model, 3, Q=1.0, **disturbed))
     with pytest.raises(QPError, match=r"^known: got 2e\+11 of d, expected at most 1e\+11 in size"):
-        controller.step([0.0], [0.0], known=[2e11, 0.0, 0.0])
+        controller.reset([0.0], known=[2e11, 0.0, 0.0])
+    assert controller.step([0.0], [0.0], known=[2e11, 0.0, 0.0]) == controller.u
+    assert controller.status.name == "INVALID"
     assert controller.known is None
     assert np.isfinite(controller.step([1e8], [1e8], known=[1e11, 1e8, 1e30])).all()
 

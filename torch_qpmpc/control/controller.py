@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_flag, check_kind
 from torch_qpmpc.control.exporting import ControllerExport, export_controller
-from torch_qpmpc.control.law import Law, Memory, Signals
+from torch_qpmpc.control.law import Law, Memory, Outcome
 from torch_qpmpc.control.learning import LearningReport, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, simulate
-from torch_qpmpc.control.state_space import Array, read_row
-from torch_qpmpc.errors import SolverError
+from torch_qpmpc.control.state_space import Array, read_measured, read_row
 from torch_qpmpc.files import damaged, load_file, save_file
 
 if TYPE_CHECKING:
@@ -56,8 +57,9 @@ class Controller:
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         r: the set-points of the last step, without rows before the first.
-        p: the input of the last step's plan, ``(n_p,)``.
-        target: the `Target` of the last step, None before the first; with a preview, of all stages.
+        status: the `Outcome` of the last step, SOLVED before the first.
+        p: the input of the last plan, ``(n_p,)``.
+        target: the `Target` of the last plan, None before the first; with a preview, of all stages.
 
     Raises:
         QPError: an argument is invalid, or the model has no filter.
@@ -110,6 +112,7 @@ class Controller:
     def _start(self, memory: Memory) -> None:
         """Take a memory without a step."""
         self._memory = memory
+        self.status = Outcome.SOLVED
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.n_p)
 
@@ -136,17 +139,17 @@ class Controller:
     @property
     def x(self) -> Array:
         """The estimate of the state, zero before the first step."""
-        return self._law.estimates(self._memory)[0]
+        return self._law.estimates(self._memory)[0].copy()
 
     @property
     def w(self) -> Array:
         """The estimate of the disturbances, zero before the first step."""
-        return self._law.estimates(self._memory)[1]
+        return self._law.estimates(self._memory)[1].copy()
 
     @property
     def u(self) -> Array:
         """The last input, ``(m,)``."""
-        return self._memory.u
+        return self._memory.u.copy()
 
     @property
     def r(self) -> Array:
@@ -161,30 +164,77 @@ class Controller:
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
         """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.
 
+        It raises for no value of a signal: the estimates go on, and `status` says what was found.
+
         Args:
-            y: outputs, by name or as a vector ``(n_y,)``.
+            y: outputs, by name or as a vector ``(n_y,)``. One that is None, NaN or above
+                `max_plausible` is missing, all are if y is None: its prediction takes its place.
             r: set-points in the same forms, by default the last ones; with a preview also rows for
                 the stages 0, .., N; the last one is held.
             known: known signals for the stages 0, .., N, as a DataFrame or a mapping of columns
                 with at least N + 1 rows; or one row, which is held.
 
+        Returns:
+            The plan's first input; without a plan the last input, within its bounds.
+
         Raises:
-            QPError: an argument is invalid or missing, or a signal is above `max_plausible`.
-            SolverError: no input satisfies the hard bounds. The last input `u` stays in force, and
-                the estimates go on with it.
+            QPError: a name or shape is wrong, or set-points or known signals are missing.
         """
         law, rows = self._law, self.mpc.horizon + 1
-        ahead, measured = law.read_known(known, rows), law.read("y", y, 1)[0]
-        signals = Signals(measured, law.read_set_points(r, rows, self.r), ahead)
-        try:
-            move = law.step(self._memory, *signals)
-        except SolverError:
-            self._memory = law.held(self._memory, *signals)
-            raise
-        self._memory, self.target, self.p = move.memory, move.target, move.p
+        ahead = law.read_known(known, rows, sane=False)
+        set_points = law.read_set_points(r, rows, self._memory.r, sane=False)
+        measured = read_measured("y", y, law.design.plant.outputs)
+        move = law.step(self._memory, measured, set_points, ahead)
+        self._memory, self.status = move.memory, move.status
+        if move.target is not None and move.p is not None:
+            self.target, self.p = move.target, move.p
         if isinstance(y, Mapping):
             return dict(zip(law.design.plant.inputs, move.u.tolist(), strict=True))
         return move.u.copy()
+
+    def observe(self, y: Any, u: Any, known: Any = None) -> None:
+        """Take note of a step in manual mode, in which another input than this one's was applied.
+
+        The next `step` moves from it, with estimates that have followed: without a bump.
+
+        Args:
+            y: outputs, as in `step`.
+            u: the input that was applied, by name or as a vector ``(m,)``. The last one stands for
+                an entry that is None, NaN or absurd.
+            known: the known signals of this step, in the forms of `step`.
+
+        Raises:
+            QPError: a name or shape is wrong, or known signals are missing.
+        """
+        law, ahead = self._law, self._law.read_known(known, 1, sane=False)
+        applied = read_measured("u", u, law.design.plant.inputs)
+        measured = read_measured("y", y, law.design.plant.outputs)
+        self._memory, self.status = law.observed(self._memory, measured, applied, ahead)
+
+    def redesign(self, **changes: Any) -> None:
+        """Change bounds and weights between two steps; the estimates and the last input stay.
+
+        The observer stays, too; it follows from the bounds that the controller was made with.
+
+        Args:
+            changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
+                ``du_bounds`` and ``y_slack`` of `LinearMPC`; the others stay.
+
+        Raises:
+            QPError: an argument is invalid, or the MPC learns.
+
+        Example:
+            >>> import torch_qpmpc as qm
+            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+            >>> controller = qm.Controller(mpc)
+            >>> controller.redesign(u_bounds=(-0.2, 0.2))
+            >>> controller.step([0.0], r=[1.0])
+            array([0.2])
+        """
+        mpc = self.mpc.redesigned(**changes)
+        self._law = replace(self._law, mpc=mpc, qp=mpc.quadratic_program())
+        u = np.clip(self.u, *mpc.design.u_bounds)
+        self._memory = self._memory._replace(u=u)
 
     def save(self, path: str | Path) -> None:
         """Write this controller with its estimates and last input to ``path``; no code is in it.

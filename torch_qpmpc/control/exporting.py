@@ -15,7 +15,7 @@ import numpy as np
 
 from torch_qpmpc.control.design import half_range, largest
 from torch_qpmpc.control.disturbance import RANK
-from torch_qpmpc.control.law import Law, Memory, Signals
+from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.simulation import Course, at_rest, centre, last_known, own_loop
 from torch_qpmpc.control.state_space import Array, StateSpace
@@ -102,8 +102,11 @@ class CompiledController:
     def __init__(self, files: Mapping[str, str], name: str, dtype: str, n_u: int) -> None:
         size = SIZE.replace("policy", name)
         library = compiled({**files, "size_.c": size}, FLAGS)
-        self._step, self._reset = library[f"{name}_step"], library[f"{name}_reset"]
-        self._step.argtypes, self._reset.argtypes = [ctypes.c_void_p] * 5, [ctypes.c_void_p] * 3
+        self._step, self._reset, self._observe = (
+            library[f"{name}_{function}"] for function in ("step", "reset", "observe")
+        )
+        for function, pointers in ((self._step, 5), (self._reset, 4), (self._observe, 4)):
+            function.argtypes = [ctypes.c_void_p] * pointers
         self.selftest = library[f"{name}_selftest"]
         state_size = library[f"{name}_state_size"]
         state_size.restype = ctypes.c_ulong
@@ -111,26 +114,28 @@ class CompiledController:
         self._state, self._u = np.zeros(self.state_bytes, np.uint8), np.zeros(n_u, self._dtype)
         self.reset()
 
-    def reset(self, y: Any = None, u: Any = None) -> None:
+    def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
         """Forget the past, as ``policy_reset``."""
-        signals = self._numbers(y, u)
-        pointers = (None if x is None else x.ctypes.data for x in signals)
-        self._reset(self._state.ctypes.data, *pointers)
+        self._call(self._reset, y, u, known)
+
+    def observe(self, y: Any, u: Any, known: Any = None) -> int:
+        """Take note of an input that was applied, as ``policy_observe``; return its code."""
+        return self._call(self._observe, y, u, known)
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> tuple[Array, int]:
         """Return the input and the code of a step; r and known have all rows."""
-        signals = self._numbers(y, r, known)
-        pointers = (None if x is None else x.ctypes.data for x in signals)
-        code = self._step(self._state.ctypes.data, *pointers, self._u.ctypes.data)
-        return self._u.astype(np.float64), int(code)
+        code = self._call(self._step, y, r, known, self._u)
+        return self._u.astype(np.float64), code
 
     def policy(self, signals: Signals) -> Any:
         """Return the move of a step, with a NaN input if its code is not 0."""
         u, code = self.step(*signals)
-        return SimpleNamespace(u=np.where(code == 0, u, np.nan))
+        return SimpleNamespace(u=np.where(code == 0, u, np.nan), status=Outcome.SOLVED)
 
-    def _numbers(self, *signals: Any) -> list[Any]:
-        return [None if x is None else np.array(x, self._dtype, order="C") for x in signals]
+    def _call(self, function: Any, *signals: Any) -> int:
+        numbers = [None if x is None else np.asarray(x, self._dtype, order="C") for x in signals]
+        pointers = (None if x is None else x.ctypes.data for x in numbers)
+        return int(function(self._state.ctypes.data, *pointers))
 
 
 def export_controller(
@@ -213,7 +218,7 @@ def undetermined(mpc: LinearMPC) -> str:
 def own_bytes(law: Law, dtype: str) -> tuple[int, int]:
     """Return the bytes of a controller's tables and state in C without its QPs."""
     real, size = np.dtype(dtype).itemsize, _sizes(law)
-    reals = size["N_E"] + size["N_X"] + 2 * size["N_U"] + (size["SET_POINTS"] + 2) * size["N_Y"]
+    reals = size["N_E"] + size["N_X"] + 2 * size["N_U"] + (size["SET_POINTS"] + 1) * size["N_Y"]
     reals += size["N_D_"] + law.mpc.n_p
     tables = sum(x.size for x in _tables(law, dtype).values())
     return tables * real, (reals + 1) * real  # the state ends with an int
@@ -264,11 +269,9 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
     near = 0.01 * NEAR[dtype] * half_range(law.design.u_bounds)
     policy = law.policy(law.begun(loop.start[0]))
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
-        try:
-            off = np.abs(policy(Signals(y * (1 + rounding[k]), r, known)).u - u)
-        except SolverError:  # at the edge of hard bounds
-            off = np.full_like(u, np.inf)
-        if k == REPLAYED or (k and (off > near).any()):
+        move = policy(Signals(y * (1 + rounding[k]), r, known))
+        # At the edge of hard bounds there may be no plan.
+        if k == REPLAYED or (k and (move.status or (np.abs(move.u - u) > near).any())):
             return Loop(loop.y[:k], loop.r[:k], loop.known[:k], loop.u[:k], loop.start)
     return loop
 
@@ -352,6 +355,7 @@ def _tables(law: Law, dtype: str) -> dict[str, Array]:
         "U_UPPER": design.u_bounds[1],
         **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(law.mpc, dtype), strict=True)),
         **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
+        "MOST_U": law.max_plausible_u,
     }
 
 

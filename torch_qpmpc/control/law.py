@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.design import Design, half_range, largest
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.observer import SMALL, Observer, kalman, max_plausible, windowed
+from torch_qpmpc.control.observer import ABSURD, SMALL, Observer, kalman, max_plausible, windowed
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
-from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.program import QuadraticProgram
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.solve import solve
 
 
 class Memory(NamedTuple):
@@ -37,20 +39,41 @@ class Memory(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """The signals of a step: outputs ``(n_y,)``, set-points and known signals of the stages."""
+    """The signals of a step: outputs ``(n_y,)``, set-points and known signals of the stages.
+
+    An output that is NaN or above `Law.max_plausible` is missing.
+    """
 
     y: Array
     r: Array
     known: Array
 
 
+class Outcome(IntEnum):
+    """What a step has come to; functions in C return the same numbers.
+
+    ``SOLVED``: all outputs are seen, and the input is optimal. ``MISSING``: so it is, for estimates
+    that lack the correction by a missing output. Otherwise the last input stays, within its bounds:
+    ``LIMIT`` without a certified plan, ``INFEASIBLE`` if no plan satisfies the hard bounds, and
+    ``INVALID`` if a set-point or known signal is not finite or above `Law.max_plausible`, or an
+    output is missing before there are estimates.
+    """
+
+    SOLVED = 0
+    LIMIT = 1
+    INFEASIBLE = 2
+    INVALID = 3
+    MISSING = 4
+
+
 class Move(NamedTuple):
-    """The result of a step: the input, the memory after it, the target and p of the plan."""
+    """The result of a step: the input, the memory after it, and target and p of a plan, if any."""
 
     u: Array
     memory: Memory
-    target: Target
-    p: Tensor
+    status: Outcome
+    target: Target | None = None
+    p: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,33 +137,74 @@ class Law:
 
     @torch.no_grad()
     def step(self, memory: Memory, y: Array, r: Array, known: Array) -> Move:
-        """Return the input for the `Signals` of a step.
+        """Return the input for the `Signals` of a step: the last one if there is no plan.
 
-        Raises:
-            SolverError: no input satisfies the hard bounds.
+        It raises for no value of them, so that the estimates go on.
         """
-        design, e = self.design, self._corrected(memory, y, known)
+        design, (memory, e, status) = self.design, self._seen(memory, y, known)
+        if valid := self._are_plausible(r, 0).all():
+            memory = memory._replace(r=r)
+        if e is None or status == Outcome.INVALID or not valid:
+            return Move(memory.u, self._after(memory, e, memory.u), Outcome.INVALID)
         x, w = np.split(e, [len(design.plant.A)])
         previewed, level = design.references == "preview", known.mean(0)
-        target = self.mpc.target(r if previewed else r[0], w, level)
-        p = self.mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
-        u = (target.u[-1] if previewed else target.u) + self.mpc.policy(p, qp=self.qp)
+        mpc, kept, held = self.mpc, self.mpc.n_p + self.mpc.n_u, self._after(memory, e, memory.u)
+        try:
+            target = mpc.target(r if previewed else r[0], w, level)
+        except SolverError:
+            return Move(memory.u, held, Outcome.INFEASIBLE)
+        p = mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
+        plan = solve(self.qp, p.to(self.qp.q.dtype), kept, mpc.solver, "mask", None)
+        if plan.status != Status.SOLVED:
+            proved = plan.status == Status.INFEASIBLE
+            return Move(memory.u, held, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
+        u = (target.u[-1] if previewed else target.u) + plan.z[mpc.n_p : kept].cpu()
         u = np.clip(u.numpy(), *design.u_bounds)
-        return Move(u, self._after(memory, e, u, r, known), target, p)
+        return Move(u, self._after(memory, e, u), status, target, p)
 
-    def held(self, memory: Memory, y: Array, r: Array, known: Array) -> Memory:
-        """Return the memory after a step without a plan, in which the last input stays."""
-        return self._after(memory, self._corrected(memory, y, known), memory.u, r, known)
+    def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
+        """Return the memory after a step in which the input u was applied, and its status.
 
-    def _corrected(self, memory: Memory, y: Array, known: Array) -> Array:
-        """Return the estimate of x and w from the prediction and the outputs."""
+        The last input takes the place of an implausible entry of u, and is clipped into the bounds
+        afterwards: the next step moves from there.
+        """
+        memory, e, status = self._seen(memory, y, known)
+        u = np.where(np.abs(u) <= self.max_plausible_u, u, memory.u)
+        return self._after(memory, e, u), status
+
+    @property
+    def max_plausible_u(self) -> Array:
+        """The largest size of an input that was applied, ``(m,)``."""
+        bounds = self.design.u_bounds
+        return ABSURD * np.maximum(largest(bounds), half_range(bounds))
+
+    def _are_plausible(self, signals: Array, known: int) -> Array:
+        """Return the mask of outputs and set-points, or known signals, that may be measurements."""
+        return np.isfinite(signals) & (np.abs(signals) <= self.max_plausible[known])
+
+    def _seen(self, memory: Memory, y: Array, known: Array) -> tuple[Memory, Array | None, Outcome]:
+        """Return the memory with the known signals, the estimate corrected by y, and the status.
+
+        The innovation of a missing output is zero, as if it were the predicted one: the gains of
+        the others are right for a steady state, and need no second factorisation in C. Rows of
+        known signals with an implausible entry are not taken; the last ones hold.
+        """
+        seen, valid = self._are_plausible(y, 0), self._are_plausible(known, 1).all()
+        memory = memory._replace(known=known[0]) if valid else memory
         observer, e = self.observer, memory.e
+        if e is None and not (valid and seen.all()):
+            return memory, None, Outcome.INVALID
         e = observer.at_rest(memory.u, known[0], y) if e is None else e
-        return e + observer.L @ (y - observer.H @ e)
+        e = e + observer.L @ np.where(seen, y - observer.H @ e, 0.0)
+        status = Outcome.SOLVED if seen.all() else Outcome.MISSING
+        return memory, e, status if valid else Outcome.INVALID
 
-    def _after(self, memory: Memory, e: Array, u: Array, r: Array, known: Array) -> Memory:
-        e = self.observer.predicted(e, u, known[0])
-        return memory._replace(u=u, e=e, r=r, known=known[0])
+    def _after(self, memory: Memory, e: Array | None, u: Array) -> Memory:
+        """Return the memory after a step with the input u."""
+        if e is not None:
+            assert memory.known is not None
+            e = self.observer.predicted(e, u, memory.known)
+        return memory._replace(u=np.clip(u, *self.design.u_bounds), e=e)
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""
@@ -153,12 +217,15 @@ class Law:
 
         return policy
 
-    def read_known(self, known: Any, rows: int, least: int | None = None) -> Array:
+    def read_known(
+        self, known: Any, rows: int, least: int | None = None, sane: bool = True
+    ) -> Array:
         """Return known signals, in the forms of `Controller.step`, as ``(rows, n_d)``.
 
         Args:
             known: one row, or at least ``least`` rows, by default all.
             rows, least: numbers of rows.
+            sane: see `read`.
 
         Raises:
             QPError: they are invalid or missing.
@@ -170,15 +237,16 @@ class Law:
             remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
             remedy += "it in info['known']."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
-        return self.read("known", known, rows, rows if least is None else least)
+        return self.read("known", known, rows, rows if least is None else least, sane)
 
-    def read_set_points(self, r: Any, rows: int, last: Array) -> Array:
+    def read_set_points(self, r: Any, rows: int, last: Array, sane: bool = True) -> Array:
         """Return set-points, in the forms of `Controller.step`, as ``(rows, n_y)``.
 
         Args:
             r: set-points, by default the ``last`` ones.
             rows: the number of rows.
             last: the set-points of the last step, without rows before the first.
+            sane: see `read`.
 
         Raises:
             QPError: they are invalid, or None in the first step.
@@ -189,16 +257,21 @@ class Law:
             raise QPError.expected("r", "None in the first step", want)
         if r is None:
             r = last if len(last) else np.zeros(len(outputs))
-        return self.read("r", r, rows)
+        return self.read("r", r, rows, sane=sane)
 
-    def read(self, name: str, value: Any, rows: int, least: int = 1) -> Array:
-        """Return rows of y, r or known signals, none of them above `max_plausible`."""
+    def read(self, name: str, value: Any, rows: int, least: int = 1, sane: bool = True) -> Array:
+        """Return rows of y, r or known signals.
+
+        Raises:
+            QPError: a name or shape is wrong, or (if they must be ``sane``) a number is not finite
+                or above `max_plausible`.
+        """
         plant, known = self.design.plant, name == "known"
         names = plant.known if known else plant.outputs
-        table, largest = read_table(name, value, names, rows, least), self.max_plausible[known]
-        if (above := np.abs(table) > largest).any():
+        table, most = read_table(name, value, names, rows, least, sane), self.max_plausible[known]
+        if sane and (above := np.abs(table) > most).any():
             k, i = np.argwhere(above)[0]
-            got, want = f"{table[k, i]:g} of {names[i]}", f"at most {largest[i]:.3g} in size"
+            got, want = f"{table[k, i]:g} of {names[i]}", f"at most {most[i]:.3g} in size"
             remedy = f"If it is no error, measure {names[i]} in a larger unit."
             raise QPError.expected(name, got, want, remedy)
         return table

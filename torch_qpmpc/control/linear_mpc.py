@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -128,21 +128,17 @@ class LinearMPC(QPMPC):
         prices = linear.values() if isinstance(linear, Mapping) else ()
         plant = read_model(model, E, dt, inputs, outputs, known, prices)
         check_whole("horizon", horizon, 1)
+        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
+        bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         design = Design(
-            plant,
-            int(horizon),  # pyright: ignore[reportArgumentType] - a number
-            read_weight("Q", Q, plant.outputs),
-            read_weight("R", R, plant.inputs),
-            read_weight("dR", dR, plant.inputs),
-            read_bounds("y_bounds", y_bounds, plant.outputs),
-            read_bounds("u_bounds", u_bounds, plant.inputs),
-            read_moves(du_bounds, plant.inputs),
-            read_vector("y_slack", y_slack, plant.outputs, 0.0),
-            read_prices(linear, plant),
-            references,
-            choose(plant, disturbances),
-            gamma,
-            read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
+            plant=plant,
+            horizon=int(horizon),  # pyright: ignore[reportArgumentType] - a number
+            **read_wishes(plant, **weights, **bounds),
+            linear=read_prices(linear, plant),
+            references=references,
+            disturbances=choose(plant, disturbances),
+            gamma=gamma,
+            blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
         )
         defaults = {"structure": "tied", "learn": (), "solver": "daqp"}
         super().__init__(lowered(design), **{**defaults, **options})
@@ -159,6 +155,21 @@ class LinearMPC(QPMPC):
         """The `Design` of the arguments."""
         assert self.scheme.design is not None
         return self.scheme.design
+
+    def redesigned(self, **changes: Any) -> LinearMPC:
+        """Return this MPC with other bounds or weights.
+
+        Args:
+            changes: as in `Controller.redesign`.
+
+        Raises:
+            QPError: an argument is invalid, or this MPC learns.
+        """
+        if self.learned:
+            got, remedy = f"an MPC that learns {', '.join(self.learned)}", "Change its parameters."
+            raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
+        design = replace(self.design, **read_wishes(self.design.plant, **changes))
+        return LinearMPC(lowered(design), **{name: self.arguments[name] for name in KEYWORDS})
 
     @property
     def constants(self) -> dict[int, float]:
@@ -298,6 +309,26 @@ class LinearMPC(QPMPC):
                 want = f"{part.shape[-1]} entries, and batch dimensions as those of x"
                 raise QPError.expected(name, f"shape {tuple(value.shape)}", want) from error
         return torch.cat((d.flatten(-2), state), -1)
+
+
+def read_wishes(plant: StateSpace, **wishes: Any) -> dict[str, Any]:
+    """Read weights and bounds by their arguments' names in `LinearMPC`.
+
+    Raises:
+        QPError: one is invalid, or has another name.
+    """
+    y, u = plant.outputs, plant.inputs
+    readers: dict[str, Callable[[str, Any], Any]] = {
+        "Q": lambda name, value: read_weight(name, value, y),
+        "R": lambda name, value: read_weight(name, value, u),
+        "dR": lambda name, value: read_weight(name, value, u),
+        "y_slack": lambda name, value: read_vector(name, value, y, 0.0),
+        "y_bounds": lambda name, value: read_bounds(name, value, y),
+        "u_bounds": lambda name, value: read_bounds(name, value, u),
+        "du_bounds": lambda _, value: read_moves(value, u),
+    }
+    check_keywords("redesign", wishes, [*readers])
+    return {name: readers[name](name, value) for name, value in wishes.items()}
 
 
 def _shifted(place: slice, by: int) -> slice:

@@ -160,7 +160,11 @@ def simulate(
 
     def policy(y: Array) -> Move:
         ahead = law.read_known(info.get("known"), rows) if announced else d[k : k + rows]
-        return act(Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead))
+        move = act(Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead))
+        if move.target is None:
+            remedy = "Widen the hard bounds, or give the outputs a y_slack."
+            raise SolverError(f"Step {k} of the loop has no plan: {move.status.name}. {remedy}")
+        return move
 
     def step(move: Move) -> Step:
         nonlocal observed, info, k
@@ -281,7 +285,9 @@ def own_loop(
         return Step(seen(), move)
 
     signals = seen()
-    for after, move, _ in run_loop(policy, signals, step, steps, SolverError):
+    for after, move, _ in run_loop(policy, signals, step, steps):
+        if move.status:
+            return
         yield signals, move
         if (np.abs(after.y) > law.max_plausible[0]).any():
             return

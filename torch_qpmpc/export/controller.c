@@ -30,12 +30,14 @@ static void copy(real *to, const real *from, int n)
     for (i = 0; i < n; i++) to[i] = from[i];
 }
 
-/* Return 1 if no entry of rows of x is above `most` in size; a NaN is. */
+/* Return 1 if x is not above `most` in size; a NaN is. */
+static int is_sane(real x, real most) { return x <= most && -x <= most; }
+
 static int are_sane(const real *x, const real most[], int rows, int columns)
 {
     int i;
     for (i = 0; i < rows * columns; i++)
-        if (!(x[i] <= most[i % columns] && -x[i] <= most[i % columns])) return 0;
+        if (!is_sane(x[i], most[i % columns])) return 0;
     return 1;
 }
 
@@ -44,13 +46,13 @@ static real within(real x, int i)
     return x < U_LOWER[i] ? U_LOWER[i] : x > U_UPPER[i] ? U_UPPER[i] : x;
 }
 
-/* Predict the estimates of the next step. */
-static void predict(policy_state *s)
+/* Predict the estimates of the next step with the input u. */
+static void predict(policy_state *s, const real u[])
 {
     real next[N_E];
     copy(next, OFFSET, N_E);
     add(next, &F[0][0], N_E, N_E, s->e);
-    add(next, &G[0][0], N_E, N_U, s->u);
+    add(next, &G[0][0], N_E, N_U, u);
     add(next, &E[0][0], N_E, N_D, s->known);
     copy(s->e, next, N_E);
 }
@@ -61,22 +63,36 @@ static void rest(policy_state *s, const real y[])
     real known[N_E + N_Y];
     int i;
     for (i = 0; i < N_E; i++) s->e[i] = 0;
-    predict(s);
+    predict(s, s->u);
     for (i = 0; i < N_E; i++) known[i] = -s->e[i];
     copy(known + N_E, y, N_Y);
     for (i = 0; i < N_E; i++) s->e[i] = 0;
     add(s->e, &REST[0][0], N_E, N_E + N_Y, known);
 }
 
-/* Correct the estimates by measured outputs. */
-static void correct(policy_state *s, const real y[])
+/* Correct the estimates by those outputs that are not missing; return a code. Rows of known signals
+   that are not sane are not taken, the last ones hold. */
+static int see(policy_state *s, const real y[], const real known[], int stages)
 {
     real error[N_Y];
-    int i, j;
-    copy(error, y, N_Y);
-    for (i = 0; i < N_Y; i++)
+    int i, j, missing = 0, valid = are_sane(known, MOST_KNOWN, stages, N_D);
+    if (valid) copy(s->known, known, N_D);
+    if (s->starts) {
+        if (!valid || !y || !are_sane(y, MOST_Y, 1, N_Y)) return POLICY_INVALID;
+        rest(s, y);
+        s->starts = 0;
+    }
+    for (i = 0; i < N_Y; i++) {
+        error[i] = 0;
+        if (!y || !is_sane(y[i], MOST_Y[i])) {
+            missing = 1;
+            continue;
+        }
+        error[i] = y[i];
         for (j = 0; j < N_E; j++) error[i] -= H[i][j] * s->e[j];
+    }
     add(s->e, &L[0][0], N_E, N_Y, error);
+    return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
 }
 
 /* Set the target for the set-point of a stage; return the code of its QPs. */
@@ -144,7 +160,7 @@ static int plan(policy_state *s, const real known[])
     return code;
 }
 
-void policy_reset(policy_state *s, const real y[], const real u[])
+void policy_reset(policy_state *s, const real y[], const real u[], const real known[])
 {
     int i;
     policy_plan_reset(&s->plan);
@@ -153,27 +169,35 @@ void policy_reset(policy_state *s, const real y[], const real u[])
     policy_free_reset(&s->free);
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
-    for (i = 0; i < N_U; i++) s->u[i] = within(u && u[i] - u[i] == 0 ? u[i] : 0, i);
+    for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;
+    for (i = 0; i < N_U; i++) s->u[i] = within(u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
-    s->starts = y && are_sane(y, MOST_Y, 1, N_Y) ? 2 : 1;
-    if (s->starts == 2) copy(s->y, y, N_Y);
+    s->starts = 1;
+    if (y && are_sane(y, MOST_Y, 1, N_Y) && (!N_D || (known && are_sane(known, MOST_KNOWN, 1, N_D)))) {
+        copy(s->known, known, N_D);
+        rest(s, y);
+        s->starts = 0;
+    }
+}
+
+int policy_observe(policy_state *s, const real y[], const real u[], const real known[])
+{
+    int i, code = see(s, y, known, 1);
+    real applied[N_U];
+    for (i = 0; i < N_U; i++) applied[i] = u && is_sane(u[i], MOST_U[i]) ? u[i] : s->u[i];
+    if (!s->starts) predict(s, applied);
+    for (i = 0; i < N_U; i++) s->u[i] = within(applied[i], i);
+    return code;
 }
 
 int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
 {
-    int code = POLICY_INVALID;
-    if (are_sane(y, MOST_Y, 1, N_Y) && (!r || are_sane(r, MOST_Y, SET_POINTS, N_Y)) &&
-        are_sane(known, MOST_KNOWN, STAGES, N_D)) {
-        if (r) copy(s->r, r, SET_POINTS * N_Y);
-        copy(s->known, known, N_D);
-        if (s->starts) rest(s, s->starts == 2 ? s->y : y);
-        s->starts = 0;
-        correct(s, y);
-        code = plan(s, known);
-    }
-    if (!s->starts) predict(s);
+    int code, seen = see(s, y, known, STAGES), sane = !r || are_sane(r, MOST_Y, SET_POINTS, N_Y);
+    if (r && sane) copy(s->r, r, SET_POINTS * N_Y);
+    code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
+    if (!s->starts) predict(s, s->u);
     copy(u, s->u, N_U);
-    return code;
+    return code ? code : seen;
 }
 
 /* @EXAMPLES@ */
@@ -188,7 +212,7 @@ int policy_selftest(void)
 #if POLICY_N_F
     if (policy_free_selftest()) return 2;
 #endif
-    policy_reset(&state, 0, EXAMPLE_START[0]);
+    policy_reset(&state, 0, EXAMPLE_START[0], 0);
     for (i = 0; i < EXAMPLES; i++) {
         if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;
         for (j = 0; j < N_U; j++) {

@@ -20,7 +20,8 @@ typedef policy_plan_real policy_real;
 #define POLICY_SOLVED 0     /* u is optimal, and certified to be */
 #define POLICY_LIMIT 1      /* not certified within the limit of iterations, or to rounding */
 #define POLICY_INFEASIBLE 2 /* no plan or no steady state satisfies the hard bounds */
-#define POLICY_INVALID 3    /* y, r or known has a NaN, or a number too large to be one of them */
+#define POLICY_INVALID 3    /* r or known, or y before there are estimates, has a missing number */
+#define POLICY_MISSING 4    /* as POLICY_SOLVED, for estimates that y, with a missing number, left */
 
 /* The state of a controller: estimates, the last signals, and the active sets of all QPs. */
 typedef struct {
@@ -31,32 +32,42 @@ typedef struct {
     policy_real x_s[POLICY_N_X];                 /* the target: state, input and outputs */
     policy_real u_s[POLICY_N_U];
     policy_real y_s[POLICY_N_Y];
-    policy_real y[POLICY_N_Y];                   /* where the plant rests, see policy_reset */
     policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
     policy_plan_state plan;
     policy_target_state target;
 #if POLICY_N_F
     policy_free_state free;
 #endif
-    int starts;                                  /* 1 before the first step, 2 with a y to rest at */
+    int starts;                                  /* 1 before there are estimates */
 } policy_state;
 
-/* Forget the past: the plant rests with the outputs y, those of the first step if y is null, and
-   with the input u, the one nearest to zero within its bounds if u is null. A y with a NaN or
-   a number too large is as none, and so is an entry of u that is not finite.
+/* A number is missing if it is not finite, or above MOST_Y, MOST_KNOWN or MOST_U of policy.c, 1e8
+   times a usual size, as a sensor's 3.4e38 for "bad". Python's Controller does the same. */
+
+/* Forget the past: the plant rests with the outputs y, the input u and the known signals of this
+   step, of which there are POLICY_N_D. If one of y or known is missing, or the pointer is null, it
+   rests with those of the first step; a missing entry of u is zero. u is clipped into its bounds.
 
    u is the last input, which moves are counted from: another than the plant's is a bump. */
-void policy_reset(policy_state *state, const policy_real y[], const policy_real u[]);
+void policy_reset(policy_state *state, const policy_real y[], const policy_real u[],
+                  const policy_real known[]);
 
 /* Write the input u for measured outputs y; return one of the codes above.
 
-   r has POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last
-   ones; they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and
-   later steps. A signal above MOST_Y or MOST_KNOWN of policy.c, 1e8 times a usual size, is an error
-   as a NaN is. With the code 0, u keeps the bounds of inputs and of their moves to rounding; with
-   another it is the last input, which keeps them, too, and the estimates go on. */
+   A missing output, all of them if y is null, leaves the estimates as predicted. r has
+   POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last ones;
+   they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and later
+   steps. With the codes 0 and 4, u keeps the bounds of inputs and of their moves to rounding; with
+   another it is the last input, which keeps them, too. The estimates go on with each code. */
 int policy_step(policy_state *state, const policy_real y[], const policy_real r[],
                 const policy_real known[], policy_real u[]);
+
+/* Take note of a step in manual mode: of the outputs y, the input u that was applied, and the known
+   signals of this step alone; return POLICY_SOLVED, POLICY_MISSING or POLICY_INVALID.
+
+   The last input stands for a missing u. The next policy_step moves from u, without a bump. */
+int policy_observe(policy_state *state, const policy_real y[], const policy_real u[],
+                   const policy_real known[]);
 
 /* Test all QPs and replay a closed loop; return 0, or the number of what fails: the plan's QP, one
    of the target's, and the steps of the loop. Only one thread at a time may call it. */

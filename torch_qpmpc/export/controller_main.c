@@ -19,7 +19,7 @@ int main(void)
     real x[POLICY_N_X], next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
     int i, j, k, code = policy_selftest();
     if (code) fprintf(stderr, "self-test: number %d fails\n", code);
-    policy_reset(&state, 0, START_U);
+    policy_reset(&state, 0, START_U, 0);
     for (i = 0; i < POLICY_N_X; i++) x[i] = START_X[i];
     for (k = 0; k < STEPS && !code; k++) {
         for (i = 0; i < POLICY_N_Y; i++)

@@ -117,7 +117,7 @@ static real highest(int row, int side)
 /* The factor: column i of L, from below its unit diagonal. */
 static real *column(policy_state *s, int i)
 {
-    return s->lower + i * (POLICY_HELD - 1) - (i * (i - 1)) / 2;
+    return s->lower + (i * (POLICY_HELD - 1) - (i * (i - 1)) / 2);
 }
 
 /* Solve L x = x. */
