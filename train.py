@@ -39,7 +39,7 @@ from torch_qpmpc.experiment.collection import (
 )
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.costs import cost_text
-from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched
 from torch_qpmpc.experiment.metrics import (
@@ -209,6 +209,7 @@ def _train(
         drop_previous(run.path / CHECKPOINT)
     if not quiet:
         print(f"\n{table(summary)}\n\n{run.path}")
+        check_rewards(evaluation.loops["learned"], physics)
     return summary
 
 
@@ -226,9 +227,9 @@ def main() -> None:
     """Run the command line."""
     try:
         sys.argv[1:] = named_task(sys.argv[1:])
+        check_overrides(sys.argv[1:], CONFIGS)
     except QPError as error:
         raise SystemExit(str(error)) from None
-    check_overrides(sys.argv[1:], CONFIGS)
     _run()
 
 

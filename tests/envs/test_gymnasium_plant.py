@@ -77,6 +77,14 @@ def test_an_unknown_environment_is_an_error(id):
             {"observations": Box(0, 255, (8, 8, 3), np.uint8)},
             r"whose observation space is Box\(0, 255, \(8, 8, 3\), uint8\), expected Box spaces",
         ),
+        *(
+            (
+                {kind: Box(0, 9, (1,), dtype)},
+                rf"whose {kind} are {dtype.__name__}, expected real numbers. Round in a wrapper",
+            )
+            for kind in ("actions", "observations")
+            for dtype in (np.int64, np.uint8)
+        ),
         ({"actions": Box(-1, 1, (2, 2))}, "whose action space is .* Box spaces of one dimension"),
     ],
 )
@@ -196,6 +204,59 @@ def test_a_terminated_episode_is_terminated(register):
     assert batch["next", "terminated"].flatten().tolist() == [False, True, False, True]
     assert batch["next", "observation"].flatten().tolist() == [1, 2, 1, 2]
     assert not batch["next", "truncated"].any()
+
+
+class Fragile(Counter):
+    """Raises in step ``at`` of each episode whose seed, or number, is odd."""
+
+    def __init__(self, at: int = 2, error: type[Exception] = FloatingPointError) -> None:
+        super().__init__(last=4)
+        self.at, self.error, self.episode = at, error, -1
+
+    def reset(self, *, seed=None, options=None):
+        self.episode = self.episode + 1 if seed is None else seed
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        if self.k + 1 == self.at and self.episode % 2:
+            raise self.error("the integrator failed")
+        return super().step(action)
+
+
+@pytest.mark.filterwarnings("ignore:The plant ends an episode")
+@pytest.mark.parametrize(("past", "at"), [(1, 1), (1, 2), (1, 4), (3, 2), (3, 4)])
+def test_an_exception_ends_its_episode_alone(monkeypatch, past, at):
+    monkeypatch.setitem(
+        gymnasium.registry, "Fragile-v0", EnvSpec("Fragile-v0", lambda **x: Fragile(**x))
+    )
+    plant = GymnasiumPlant("Fragile-v0", at=at).windowed(past)
+    loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
+    assert loop.raised is not None
+    assert loop.raised.tolist() == [False, True] * 2
+    assert len(plant.raised) == 2
+    assert plant.raised[0].startswith("FloatingPointError: the integrator failed (")
+    assert plant.raised[0].split("(")[1].startswith(f"{__file__}, line ")
+    assert pytest.approx(10) == loop.J
+    assert loop.J_discounted < 10
+    env = plant.vectorised(2, 5, seed=0)
+    batch = env.rollout(12, break_when_any_done=False)
+    env.close()
+    bad = batch["next", "reward"].isnan()
+    assert bad.any() or at < past  # while it waits
+    assert batch["next", "done"][bad].all()
+    assert batch["next", "observation"].isfinite().all()
+    assert len(plant.raised) > 2
+
+
+def test_a_wrong_use_of_an_environment_is_no_fault_of_the_plant(monkeypatch):
+    monkeypatch.setitem(
+        gymnasium.registry, "Fragile-v0", EnvSpec("Fragile-v0", lambda **x: Fragile(**x))
+    )
+    plant = GymnasiumPlant("Fragile-v0")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        plant.make().step(np.zeros(1, np.float32))
+    with pytest.warns(UserWarning, match="The plant ends an episode by FloatingPointError: the in"):
+        gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
 
 
 def test_one_seed_is_one_set_of_different_episodes():

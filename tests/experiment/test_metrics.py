@@ -55,6 +55,12 @@ def test_table_has_the_rivals_and_all_digits_of_large_costs():
     assert lines[6:] == [["omniscient", "20.50"], ["thermostat", "1234"]]
 
 
+@pytest.mark.parametrize("J", [(1e10, 2e10, 3e10), (-12345678901, 1e15, math.nan), (1, 2, 1e12)])
+def test_the_columns_of_a_table_stay_apart(J):
+    lines = [line.split() for line in table(evaluation(*J).summary()).splitlines()]
+    assert [float(x) for x in lines[1][1:4]] == pytest.approx(J, rel=1e-3, nan_ok=True)
+
+
 @pytest.mark.parametrize(
     ("start", "learned", "worse"),
     [

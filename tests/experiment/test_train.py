@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -20,6 +23,7 @@ from tests.runs import CONFIGS, SMALL, make_config, run_command
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs import PointMass
+from torch_qpmpc.envs.point_mass import PointMassGymEnv
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.launch import LOCK, locked
@@ -220,14 +224,22 @@ def test_command(tmp_path, monkeypatch, capsys):
         ("optimizer.lr_cost=1", "Could not override 'optimizer.lr_cost'"),
         ("+batchsize=3", "batchsize: got an unknown key"),
         ("constraint=none", "Could not find 'constraint/none'"),
+        ("resume=typo", "resume: got typo, which does not exist, expected a run's folder."),
+        ("resume='runs/no/seed1'", "resume: got runs/no/seed1, which does not exist, expected a"),
+        ("resume=/nonexist/checkpoint.pt", "resume: got /nonexist/checkpoint.pt, which does not"),
+        ("resume=.", "resume: got ., without config.yaml, expected a run's folder."),
+        ("resume=link/a", "resume: got link/a, which does not exist"),
     ],
 )
 def test_a_mistake_on_the_command_line_is_named(tmp_path, monkeypatch, capsys, mistake, sentence):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to("/usr")
     with pytest.raises(SystemExit) as error:
         run_command(mistake)
     assert error.value.code not in (0, None)
     assert sentence in capsys.readouterr().err + str(error.value.code)
+    if mistake.startswith("resume"):
+        assert [path.name for path in tmp_path.iterdir()] == ["link"]
 
 
 TINY = (*SMALL, "task.eval_steps=5")
@@ -333,6 +345,64 @@ def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overr
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
         run_command("task=gymnasium", *overrides, *SHORT)
+
+
+class Faulty(PointMassGymEnv):
+    """A point mass that raises, or has rewards of NaN, in a share of its steps."""
+
+    def __init__(self, share: float, raises: bool, after: int = 0) -> None:
+        super().__init__()
+        self.share, self.raises, self.after, self.k = share, raises, after, 0
+
+    def step(self, action):
+        s, reward, *rest = super().step(action)
+        self.k += 1
+        if self.k > self.after and self.np_random.random() < self.share:
+            if self.raises:
+                raise ArithmeticError("the integrator failed")
+            reward = float("nan")
+        return s, reward, *rest
+
+
+@pytest.mark.filterwarnings("ignore:The plant ends", "ignore:.*rewards are NaN", "ignore:Two epi")
+@pytest.mark.parametrize("start", ["model", "data"])
+@pytest.mark.parametrize(
+    ("share", "raises", "after", "wrong"),
+    [
+        (0.01, True, 0, None),
+        (1.0, True, 0, "The plant ends episodes by ArithmeticError: the integrator failed"),
+        (1.0, False, 0, "Return a number from the environment's step, or end the episode."),
+        (0.5, False, 3, "Return a number from the environment's step, or end the episode."),
+    ],
+)
+def test_a_faulty_plant_is_reported(
+    tmp_path, monkeypatch, capsys, start, share, raises, after, wrong
+):
+    """An exception ends an episode, and rewards of NaN the command, after all is written."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(
+        gymnasium.registry, "Faulty-v0", EnvSpec("Faulty-v0", lambda **x: Faulty(**x))
+    )
+    A, B, W = PointMass().A.tolist(), PointMass().B.tolist(), torch.eye(6).tolist()
+    model = [f"task.A={A}", f"task.B={B}"] if start == "model" else ["start.transitions=200"]
+    model += [f"task.stage_weight={W}", f"start={start}", "task.start_episodes=0"]
+    options = f"task.kwargs={{share: {share}, raises: {raises}, after: {after}}}"
+    arguments = ("task=gymnasium", "task.id=Faulty-v0", options, *model, *SHORT, "figures=false")
+    arguments += ("task.episode_steps=20", "hydra.run.dir=run")
+    if wrong is None:
+        run_command(*arguments)
+        summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+        assert summary["raised"] > 0
+        assert math.isfinite(summary["J_best"])
+        assert f"The plant ended {summary['raised']} episodes by exc" in capsys.readouterr().out
+        return
+    with pytest.raises(SystemExit) as error:
+        run_command(*arguments)
+    assert error.value.code not in (0, None)
+    if start == "model" or after:
+        assert "reward: got NaN in " in str(error.value)
+        assert wrong in str(error.value)
+    assert (tmp_path / "run" / "summary.json").exists() == bool(after)
 
 
 @pytest.mark.parametrize(("terminal", "quiet"), [(True, False), (True, True), (False, False)])

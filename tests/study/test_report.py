@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import json
+import shutil
+
 import pytest
 
 import train
@@ -69,6 +72,17 @@ def test_a_report_of_runs_with_a_window_and_previews(tmp_path):
 def test_many_settings_have_no_figure_side_by_side():
     frame = made_up({("gaussian", f"combined, c_2={i}"): [0.9, 0.8] for i in range(9)})
     assert not list(report.figures(frame))
+
+
+def test_a_report_has_runs_with_missing_numbers(study, tmp_path, capsys):
+    """A summary writes null for what is not finite, and may have entries of other programs."""
+    run = next((study / "weights").rglob("summary.json")).parent
+    copy = shutil.copytree(run, tmp_path / "sweep" / "run")
+    summary = json.loads((copy / "summary.json").read_text())
+    for name in ("J_best", "J_start", "J_true_model", "closed_gap", "canonical_distance"):
+        (copy / "summary.json").write_text(json.dumps(summary | {name: None, "proof": "proved"}))
+        report.main([str(tmp_path)])
+        assert "nan" in capsys.readouterr().out
 
 
 def test_errors_are_one_line(study, tmp_path):

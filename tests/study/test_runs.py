@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 import shutil
 
@@ -121,6 +122,11 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
         ("summary.json", b"[]", r"summary.json: got .* \(list indices must be integers"),
         ("summary.json", b"{}", r"summary.json: got .* \(it has no seed"),
         ("summary.json", b'{"seed": "one"}', r"summary.json: got .* \(seed is 'one'"),
+        *(
+            ("summary.json", {name: value}, rf"summary.json: got .* \({name} is {value!r}\)")
+            for name in ("J_best", "J_start", "J_true_model", "closed_gap", "canonical_distance")
+            for value in ("x", {})
+        ),
         ("metrics.csv", b"update,eval/J\n0,", r"metrics.csv: got .* \(its last line is cut off"),
         ("best.pt", None, "path: got .*best.pt, which does not exist"),
         ("best.pt", b"junk", "path: got .*best.pt, which cannot be read"),
@@ -128,12 +134,19 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
 )
 def test_a_damaged_file_is_named(gated, tmp_path, file, content, wrong):
     run = qm.load_run(shutil.copytree(gated, tmp_path / "run"))
+    if isinstance(content, dict):
+        content = json.dumps(run.summary | content).encode()
     (run.folder / file).unlink()
     if content is not None:
         (run.folder / file).write_bytes(content)
     of = {"config.yaml": "cfg", "summary.json": "summary", "metrics.csv": "metrics"}
     with pytest.raises(QPError, match=f"^{wrong}"):
         getattr(run, of.get(file, "policy"))
+    if file == "summary.json":
+        shutil.copy(run.folder / "best.pt", run.folder / "checkpoint.pt")
+        (run.folder / file).unlink(missing_ok=True)
+        with pytest.raises(QPError, match=r"a stopped run, expected a finished run\. Finish it: "):
+            _ = run.summary
 
 
 def test_a_folder_without_runs_and_a_run_with_other_keys_are_named(gated, tmp_path):

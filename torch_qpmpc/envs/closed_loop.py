@@ -31,6 +31,8 @@ class ClosedLoop:
         gamma: the discount factor of ``J_discounted``.
         n_y: the last n_y entries of p are the state or, of a `Plant`, the output; None for all.
         lengths: the numbers of steps of the episodes, ``(starts,)``; None if none ends early.
+        raised: True for the episodes that an exception of the plant ended, ``(starts,)``: J leaves
+            them out.
     """
 
     known: Tensor
@@ -39,6 +41,7 @@ class ClosedLoop:
     gamma: float
     n_y: int | None = None
     lengths: Tensor | None = None
+    raised: Tensor | None = None
 
     @property
     def states(self) -> Tensor:
@@ -48,13 +51,18 @@ class ClosedLoop:
     @property
     def J(self) -> float:
         """The mean over the starts of the sum of costs."""
-        return self.costs.sum(0).mean().item()
+        return self._mean(self.costs.sum(0))
 
     @property
     def J_discounted(self) -> float:
         """The mean over the starts of the sum of gamma^k L(s_k, a_k)."""
         weights = self.gamma ** torch.arange(len(self.costs)).to(self.costs)
-        return (weights @ self.costs).mean().item()
+        return self._mean(weights @ self.costs)
+
+    def _mean(self, total: Tensor) -> float:
+        if self.raised is not None and not self.raised.all():
+            total = total[~self.raised]
+        return total.mean().item()
 
 
 @torch.no_grad()
@@ -185,6 +193,7 @@ def gymnasium_loop(
     if plant.past > 1:
         waited = np.array([env.get_wrapper_attr("waited") for env in envs])
     over, lengths = np.zeros(starts, dtype=bool), np.zeros(starts)
+    raised = np.isnan(waited) & bool(plant.raised)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 
     def step(a: Tensor) -> Step:
@@ -193,7 +202,9 @@ def gymnasium_loop(
         s, cost, waited = s.copy(), -waited, np.zeros(starts)
         lengths[~over] += 1
         for i in np.flatnonzero(~over):
+            before = len(plant.raised)
             s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
+            raised[i] |= len(plant.raised) > before
             cost[i] -= float(reward)
             over[i] = terminated or truncated
         return Step(_float64(s), _float64(applied), _float64(cost))
@@ -209,7 +220,7 @@ def gymnasium_loop(
     loop = _run(act, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
     for env in envs:
         env.close()
-    return replace(loop, lengths=_float64(lengths))
+    return replace(loop, lengths=_float64(lengths), raised=torch.from_numpy(raised))
 
 
 def _run(

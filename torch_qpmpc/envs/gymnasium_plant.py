@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import math
+import traceback
+import warnings
 from functools import partial
 from typing import Any
 
@@ -45,6 +48,8 @@ class GymnasiumPlant:
         lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``, without a
             window.
         max_steps: the environment's own ``max_episode_steps``; 200 if it has none.
+        raised: the exceptions that ended episodes, as text. The last step of such an episode has a
+            reward of NaN, and is not learned from.
 
     Raises:
         QPError: if the environment cannot be made, or has other spaces.
@@ -57,6 +62,7 @@ class GymnasiumPlant:
     def __init__(self, id: str, **kwargs: Any) -> None:
         check_kind("task.id", id, str)
         self.id, self.past, self.kwargs = id, 1, kwargs
+        self.raised: list[str] = []
         try:
             env = self.make()
         except (gymnasium.error.Error, ImportError) as error:
@@ -85,7 +91,7 @@ class GymnasiumPlant:
         Actions within 1e-9 of zero are zero, because some plants react to any other.
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
-        env = TransformAction(env, _without_rounding, None)
+        env = TransformAction(_Guarded(env, self.raised), _without_rounding, None)
         if isinstance(env.observation_space, Dict | Tuple):
             env = FlattenObservation(env)
         return env if self.past == 1 else WindowObservation(env, self.past)
@@ -95,6 +101,10 @@ class GymnasiumPlant:
             got = f"{self.id!r}, whose {name} space is {space}"
             remedy = "Choose an environment with real vectors as observations and actions."
             raise QPError.expected("task.id", got, "Box spaces of one dimension", remedy)
+        if not np.issubdtype(space.dtype, np.floating):
+            got, want = f"{self.id!r}, whose {name}s are {space.dtype}", "real numbers"
+            remedy = "Round in a wrapper: TransformAction(env, numpy.rint, Box(low, high))."
+            raise QPError.expected("task.id", got, want, remedy)
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high
 
@@ -158,6 +168,33 @@ class GymnasiumPlant:
     def violations(self, batch: TensorDictBase) -> Tensor:
         """Return the `violation` of each transition of a collected ``batch``."""
         return self.violation(batch["observation"])
+
+
+class _Guarded(gymnasium.Wrapper):
+    """Ends the episode at an exception of the environment's step, and notes it in ``raised``."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], raised: list[str]) -> None:
+        super().__init__(env)
+        self._raised, self._last = raised, None
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self._last, info = self.env.reset(**options)
+        return self._last, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        try:
+            step = self.env.step(action)
+        except gymnasium.error.Error:  # of how the environment is used
+            raise
+        except Exception as error:
+            line = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{line.filename}, line {line.lineno}"
+            self._raised.append(f"{type(error).__name__}: {error} ({place})")
+            if len(self._raised) == 1:
+                warnings.warn(f"The plant ends an episode by {self._raised[0]}.", stacklevel=2)
+            return self._last, math.nan, False, True, {}
+        self._last = step[0]
+        return step
 
 
 def _without_rounding(action: np.ndarray) -> np.ndarray:

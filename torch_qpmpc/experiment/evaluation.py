@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from omegaconf import DictConfig
@@ -70,6 +70,8 @@ class Evaluation:
             policies["true model"] = lambda: warm_policy(true_mpc)
         rivals = _rivals(cfg, physics)
         loops = _run(cfg, physics, policies | rivals, quiet)
+        first = loops["start"]  # of which a finite state has a cost, whatever comes later
+        check_rewards(replace(first, costs=first.costs[:1]), physics)
         costs = {name: loops.pop(name).J for name in rivals}
         return cls(
             cfg, physics, {"start": loops["start"], "learned": loops["start"], **loops}, costs
@@ -121,6 +123,16 @@ class Evaluation:
             summary[f"closed_gap{suffix}"] = closed_gap(start, best, true)
         summary["episode_steps"], summary["episodes"] = loops["learned"].costs.shape
         return summary | {"rivals": dict(self.rivals)}
+
+
+def check_rewards(loop: ClosedLoop, physics: AnyPlant) -> None:
+    """Raise `QPError` if J of a closed loop is NaN."""
+    if math.isnan(loop.J):
+        raised = getattr(physics, "raised", None)
+        remedy = "Return a number from the environment's step, or end the episode."
+        remedy = f"The plant ends episodes by {raised[0]}." if raised else remedy
+        got = f"NaN in {int(loop.costs.isnan().sum())} of {loop.costs.numel()} evaluated steps"
+        raise QPError.expected("reward", got, "numbers", remedy)
 
 
 def rival_costs(cfg: DictConfig, physics: AnyPlant) -> dict[str, float]:

@@ -19,7 +19,13 @@ from omegaconf import DictConfig, OmegaConf
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, keys, unknown_key
 from torch_qpmpc.experiment.run_folder import unwritable
-from torch_qpmpc.experiment.run_state import check_fresh, check_own_folder, folder_of, resumed
+from torch_qpmpc.experiment.run_state import (
+    check_fresh,
+    check_own_folder,
+    configured,
+    folder_of,
+    resumed,
+)
 from torch_qpmpc.experiment.sweeps import finished_run, stopped_run
 from torch_qpmpc.experiment.tasks import run_code
 
@@ -75,7 +81,7 @@ class Launch:
 
 
 def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
-    """Exit with the nearest key if an override has an unknown one, for which Hydra advises a +.
+    """Raise `QPError` for an unknown key, for which Hydra advises a +, or no run to resume.
 
     Args:
         arguments: the command line.
@@ -83,12 +89,14 @@ def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
     """
     known, groups = [*keys()], {path.name for path in Path(configs).iterdir() if path.is_dir()}
     for argument in arguments:
-        key = argument.partition("=")[0]
+        key, _, value = argument.partition("=")
+        if key == "resume" and value != "null":
+            configured(value.strip("'\""))  # before Hydra makes the run's folder
         plain = "=" in argument and re.fullmatch(r"\w+(\.\w+)*", key)
         if not plain or key in groups or key.startswith("hydra."):
             continue
         if not any(f"{x}.".startswith(f"{key}.") or key.startswith(f"{x}.") for x in known):
-            raise SystemExit(str(unknown_key(key)))
+            raise unknown_key(key)
 
 
 @contextmanager

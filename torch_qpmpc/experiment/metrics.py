@@ -62,6 +62,8 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     summary |= {"ablation": cfg.ablation, "step": cfg.step}
     summary |= {"updates": cfg.updates, **tally.summary()}
     physics = evaluation.physics
+    if raised := getattr(physics, "raised", None):
+        summary |= {"raised": len(raised), "first_raised": raised[0]}
     model = physics.true_model() if isinstance(physics, LinearSystem) else None
     return summary | structure_summary(mpc, model)
 
@@ -120,14 +122,15 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
 
 def table(summary: Mapping[str, Any]) -> str:
     """Format the outcome for the terminal."""
-    lines = [f"{'':14}{'start':>10}{'learned':>10}{'true model':>12}{'closed gap':>12}"]
+    rows = [["", "start", "learned", "true model", "closed gap"]]
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
         start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "best", "true_model"))
         gap = summary[f"closed_gap{tag.removeprefix('J')}"]
         share = gap_text(gap, start, final, true, name)
-        cell = f"  {share}" if math.isnan(gap) else f"{share:>12}"
-        start, final, true = map(cost_text, (start, final, true))
-        lines.append(f"{name:14}{start:>10}{final:>10}{true:>12}{cell}")
+        rows.append([name, *map(cost_text, (start, final, true)), share])
+    least = zip((0, 10, 10, 12), zip(*rows, strict=True), strict=False)
+    a, b, c, d = (max(n, 2 + max(map(len, column))) for n, column in least)
+    lines = [f"{x[0]:{a}}{x[1]:>{b}}{x[2]:>{c}}{x[3]:>{d}}  {x[4]:>10}" for x in rows]
     episodes, steps = summary["episodes"], summary["episode_steps"]
     lines.append(f"Mean cost of {episodes:,} episodes of at most {steps:,} steps")
     if rivals := summary["rivals"]:
@@ -139,6 +142,8 @@ def table(summary: Mapping[str, Any]) -> str:
         kept += f", the last one of which costs {cost_text(summary['J_final'])}"
         compared = next(f"{summary[x]:,} {x}" for x in COMPARED if x in summary)
         lines += ["", f"The gate kept the start: {kept}, by at most {compared} transitions."]
+    if raised := summary.get("raised"):
+        lines += ["", f"The plant ended {raised} episodes by exceptions: {summary['first_raised']}"]
     return "\n".join(lines + _worse_than_zero(summary))
 
 

@@ -22,7 +22,8 @@ from torch_qpmpc.experiment.tasks import COMMAND
 from torch_qpmpc.files import damaged, write_whole
 
 #: Entries of summary.json that are numbers or, if they are not finite, null.
-NUMBERS = ("seed", "closed_gap", "J_start", "J_final", "J_true_model")
+NUMBERS = ("seed", "closed_gap", "J_start", "J_best", "J_final", "J_true_model")
+NUMBERS += ("canonical_distance",)
 
 
 class RunFolder:
@@ -134,9 +135,12 @@ def read_summary(folder: str | Path) -> dict[str, Any]:
     """Read a finished run's summary.json.
 
     Raises:
-        QPError: the file is missing or damaged.
+        QPError: the run has not finished, or the file is missing or damaged.
     """
     file = Path(folder) / "summary.json"
+    if file.with_name(CHECKPOINT).exists() and not file.exists():
+        remedy = f"Finish it: {COMMAND} resume={folder}."
+        raise QPError.expected("folder", f"{folder}, with a stopped run", "a finished run", remedy)
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
         for name in NUMBERS:

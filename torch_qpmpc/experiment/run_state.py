@@ -173,11 +173,8 @@ def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
     """Load a stopped run's configuration and last state as data."""
     if not isinstance(path, str | Path):
         raise QPError.expected("resume", repr(path), "a path")
-    path = Path(path)
+    path, config = Path(path), configured(path)
     checkpoint = path / CHECKPOINT if path.is_dir() else path
-    config = checkpoint.with_name("config.yaml")
-    if not config.exists():
-        raise QPError.expected("resume", f"{path}, without config.yaml", "a run's folder")
     if checkpoint.with_name("summary.json").exists():
         raise QPError.expected("resume", f"{path}, which is finished", "a stopped run")
     cfg = load_config(config)
@@ -186,6 +183,20 @@ def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
     state = load_checkpoint(checkpoint)
     check_state(state, cfg)
     return cfg, state
+
+
+def configured(path: str | Path) -> Path:
+    """Return config.yaml of the run in ``path``, its folder or one of its checkpoints.
+
+    Raises:
+        QPError: there is none.
+    """
+    config = Path(folder_of(str(path), "")) / "config.yaml"
+    if not Path(path).exists():
+        raise QPError.expected("resume", f"{path}, which does not exist", "a run's folder")
+    if not config.exists():
+        raise QPError.expected("resume", f"{path}, without config.yaml", "a run's folder")
+    return config
 
 
 def check_fresh(folder: str | Path) -> None:

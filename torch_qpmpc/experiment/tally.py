@@ -74,7 +74,7 @@ class Tally:
     def add(self, batch: TensorDictBase, violation: Tensor) -> None:
         """Add an update with its collected batch and the violation of each state."""
         self.update += 1
-        self.costs.append(-batch["next", "reward"].mean().item())
+        self.costs.append(-batch["next", "reward"].nanmean().item())
         self.violation += violation.sum().item()
 
     def metrics(self) -> dict[str, float]:

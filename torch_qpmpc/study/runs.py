@@ -28,7 +28,7 @@ from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import learned_qp
 from torch_qpmpc.experiment.config import check_config, load_config, settings
-from torch_qpmpc.experiment.run_folder import read_metrics, read_summary
+from torch_qpmpc.experiment.run_folder import NUMBERS, read_metrics, read_summary
 from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.module import QPMPC
@@ -166,7 +166,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
         got = f"{folder}, without a finished run"
         raise QPError.expected("RUNS_FOLDER", got, "a folder that train.py wrote to")
     frame = pd.DataFrame(rows)
-    for name in ("closed_gap", "J_true_model"):  # null without a gap or a true model
+    for name in NUMBERS:  # null without a gap or a true model
         frame[name] = frame[name].astype(float)
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP * frame["J_start"].abs()
     frame["label"] = ""
