@@ -11,6 +11,8 @@ from tests.campaign import families
 from tests.campaign.__main__ import load, main
 from tests.campaign.families import FAMILIES, Draw, solvable, well_posed
 from tests.campaign.outcomes import judge
+from tests.campaign.rounding import answers, differences, drawn
+from tests.campaign.rounding import main as compare_rounding
 from tests.campaign.tally import Tally
 from tests.campaign.trained import trained
 from torch_qpmpc import Status, solve_qp
@@ -115,3 +117,23 @@ def test_the_verdict_does_not_depend_on_units(name, solver):
             assert torch.equal(solution.status, plain.status), units
             expected = (units["cost"] * plain.value)[plain.solved]
             assert_close(solution.value[plain.solved], expected, rtol=1e-5, atol=0)
+
+
+def test_a_unit_in_the_last_place_changes_no_answer():
+    """`python -m tests.campaign.rounding` compares thousands, also with other linear algebra."""
+    cases, seeds = drawn(1, 0), range(4)
+    plain = answers(cases, seeds, nudged=False)
+    assert {*plain} == {*cases, *(f"controller {seed}" for seed in seeds)}
+    assert list(differences(plain, answers(cases, seeds, nudged=True))) == []
+    off = {"controller 1": (plain["controller 1"][0] + 1e-5, "")}
+    off |= {"controller 0": (plain["controller 0"][0], "refused")}
+    name, *_ = cases
+    off[name] = plain[name][0] + 1, plain[name][1]
+    assert len(list(differences(plain, plain | off))) == 2 + len(plain[name][0])
+
+
+@pytest.mark.slow
+def test_other_linear_algebra_changes_no_answer(capsys):
+    variants = ["this machine", "OpenBLAS: Prescott"]
+    assert compare_rounding(["--count=1", "--controllers=2", "--variants", *variants]) == 0
+    assert "| OpenBLAS: Prescott, moved data |" in capsys.readouterr().out

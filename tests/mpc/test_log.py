@@ -154,6 +154,7 @@ PERIODS = pd.period_range("2020-09-01", periods=60, freq="15min")
     "times",
     [
         *(clock(), clock().tz_localize("Europe/Berlin"), STEPS, PERIODS, 900 * np.arange(60)),
+        *(clock().to_pydatetime().astype(object), STEPS.to_pytimedelta()),
         *(clock().astype(str), clock("%Y-%m-%dT%H:%MZ"), clock("%b %d, %Y %I:%M %p")),
         clock().floor("h"),  # four rows an hour
     ],
@@ -291,10 +292,13 @@ def test_a_short_log_is_not_called_collinear():
             (room().assign(q=[text, *map(str, range(59))]), {}, f"column: got q with '{text}' in 1")
             for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
         ),
-        (
-            room().assign(t="noon"),
-            {"time": "t"},
-            "time: got t with 'noon', expected numbers or dates of one format",
+        *(
+            (
+                room().assign(t=t),
+                {"time": "t"},
+                f"time: got t with '{t}', expected numbers or dates",
+            )
+            for t in ("noon", None, np.nan, "12:xx")
         ),
         (
             room().assign(t=["2020-09-01", *["13/09/2020"] * 59]),

@@ -378,7 +378,7 @@ def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.
 
     if name is None and TIME_INDEX not in frame.columns:
         return None
-    column = _column(frame, name := name or TIME_INDEX)
+    column = _column(frame, name := name or TIME_INDEX).infer_objects()
     if isinstance(column.dtype, pd.PeriodDtype):
         column = column.dt.to_timestamp()
     ways = [column]
@@ -388,7 +388,7 @@ def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.
             return np.asarray(numbers, dtype=float)
         column = column.where(column.astype(str).map(_bare) != name)  # a header in between
         ways = _dates(column, day_first)
-    if not ways:
+    if not ways or column.isna().all():
         got = f"{name} with {str(column.iloc[0])!r}"
         raise QPError.expected("time", got, "numbers or dates of one format")
     times = [(dates - dates.min()).dt.total_seconds().to_numpy() for dates in ways]
