@@ -9,7 +9,7 @@ import torch
 
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.log import Trajectory
-from torch_qpmpc.mpc.subspace import fit_state_space
+from torch_qpmpc.mpc.subspace import fit_state_space, held_out_errors, whiteness
 
 A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 1.0]])
@@ -24,15 +24,15 @@ def trajectory(y, u, d=None) -> Trajectory:
 
 
 def noisy(count: int, steps: int, seed: int = 0, Q=Q, R=R, A=A, B=B, C=C) -> list[Trajectory]:
-    rng, data = np.random.default_rng(seed), []
-    for _ in range(count):
-        x, u, y = rng.normal(size=len(A)), rng.uniform(-1, 1, (steps, B.shape[1])), []
-        for k in range(steps + 1):
-            y.append(C @ x + rng.multivariate_normal(np.zeros(len(R)), R))
-            if k < steps:
-                x = A @ x + B @ u[k] + rng.multivariate_normal(np.zeros(len(Q)), Q)
-        data.append(trajectory(np.array(y), u))
-    return data
+    rng, n, n_y = np.random.default_rng(seed), len(A), len(C)
+    u, x = rng.uniform(-1, 1, (count, steps, B.shape[1])), rng.normal(size=(count, n))
+    w = rng.multivariate_normal(np.zeros(n), Q, (count, steps + 1))
+    v, y = rng.multivariate_normal(np.zeros(n_y), R, (count, steps + 1)), []
+    for k in range(steps + 1):
+        y.append(x @ C.T + v[:, k])
+        if k < steps:
+            x = x @ A.T + u[:, k] @ B.T + w[:, k]
+    return [trajectory(y, u) for y, u in zip(np.stack(y, 1), u, strict=True)]
 
 
 def exact(A, B, count=20, steps=30, seed=1) -> list[Trajectory]:
@@ -81,7 +81,7 @@ def test_estimates_predict_through_what_is_missing():
 
 def test_a_fit_has_the_poles_gain_and_noise_of_the_plant():
     data = noisy(20, 200)
-    model, true = fit_state_space(data, order=3).model, true_form()
+    model, true = fit_state_space(data, 3, 10).model, true_form()
     np.testing.assert_allclose(np.sort_complex(model.poles), np.sort_complex(true.poles), atol=0.03)
     np.testing.assert_allclose(model.S, true.S, atol=0.08 * np.trace(true.S))
     np.testing.assert_array_equal(model.C, np.eye(2, 3))
@@ -119,14 +119,14 @@ def test_an_exact_plant_is_its_outputs(name, count, steps):
         np.testing.assert_allclose(model.estimates(y, u, d), y, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [None, 3])
+@pytest.mark.parametrize("order", [0, 3])
 def test_units_change_no_estimate(order):
     data, size_y, size_u = noisy(10, 50), np.array([1e6, 1e-6]), np.array([1e-6, 1e4])
     shift = np.array([3e6, -2e-6])
     scaled = [trajectory(y * size_y + shift, u * size_u, d) for y, u, d in map(tuple, arrays(data))]
     one, other = (
-        fit_state_space(data, order=order).model,
-        fit_state_space(scaled, order=order).model,
+        fit_state_space(data, order, 5).model,
+        fit_state_space(scaled, order, 5).model,
     )
     for (y, u, d), (ys, us, ds) in zip(arrays(data), arrays(scaled), strict=True):
         xi = one.estimates(y, u, d)[:, :2]
@@ -141,7 +141,7 @@ def test_missing_samples_cost_little():
     for y, u, d in arrays(data):
         y = np.where(rng.uniform(size=y.shape) < 0.1, np.nan, y)
         thinned.append(trajectory(y, u, d))
-    model, true = fit_state_space(thinned, order=3).model, true_form()
+    model, true = fit_state_space(thinned, 3, 10).model, true_form()
     own, best = (
         np.concatenate([form.errors(y, u, d, 5) for y, u, d in arrays(noisy(10, 100, seed=5))])
         for form in (model, true)
@@ -157,7 +157,7 @@ def test_outputs_that_stay_in_a_trajectory_are_known_to_the_others():
             effect[k + 1] = 0.5 * effect[k] + (hidden @ goal).ravel()
         goals = np.tile(goal, (51, 1))
         data.append(trajectory(np.hstack((y[:, :1] + effect[:, :1], goals, y[:, 1:])), u, d))
-    model = fit_state_space(data, order=4).model
+    model = fit_state_space(data, order=4, lags=5).model
     n = len(model.A)
     np.testing.assert_allclose(model.A[1], np.eye(n)[1])
     np.testing.assert_allclose(model.L[1], [0, 1, 0])
@@ -166,3 +166,20 @@ def test_outputs_that_stay_in_a_trajectory_are_known_to_the_others():
         xi = model.estimates(y, u, d)
         np.testing.assert_allclose(xi[:, 1], y[:, 1], atol=1e-9)
         assert np.square(xi[:, 0] - y[:, 0]).mean() < 0.05
+
+
+def test_order_and_lags_are_those_of_the_least_held_out_errors():
+    data = noisy(20, 60)
+    fit = fit_state_space(data)
+    best = min(row.score for row in fit.candidates)
+    assert fit.order == 3
+    assert fit.lags > 0
+    assert {row.order for row in fit.candidates} >= {0, 1, 2, 3, 4}
+    assert min(row.score for row in fit.candidates if row.order == 3) < best + 0.03
+    assert min(row.score for row in fit.candidates if row.order < 3) > best + 0.03
+    errors, outputs = held_out_errors(data, 3, fit.lags, 5), torch.cat([x.y for x in data]).numpy()
+    assert errors.shape == (1200, 5, 2)
+    assert (np.nanmean(errors**2, 0) < 0.5 * outputs.var(0)).all()
+    assert (whiteness(fit.model, data) >= 0.8).all()
+    coloured = fit.model._replace(L=0 * fit.model.L)
+    assert whiteness(coloured, data).max() < 0.6

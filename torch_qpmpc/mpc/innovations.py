@@ -55,15 +55,22 @@ class Innovations(NamedTuple):
         return poles[np.argsort(-np.abs(poles), kind="stable")]
 
     def gain(self, P: Array, seen: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return L_k, the covariance of e_k and P_{k+1} from P_k, without outputs not ``seen``."""
-        C, L, S = self.C, self.L, self.S
+        """Return L_k, the covariance of e_k and P_{k+1} from P_k.
+
+        Args:
+            P: ``(*batch, n, n)``.
+            seen: False for outputs that are not measured, ``(*batch, n_y)``.
+        """
+        C, L, S, seen = self.C, self.L, self.S, np.ones(len(self.C)) if seen is None else seen
         V = C @ P @ C.T + S
-        gain = L + (P @ C.T - L @ C @ P @ C.T) @ _inverse(V)
-        if seen is not None and not seen.all():
-            gain = np.zeros_like(L)
-            gain[:, seen] = (P @ C.T + L @ S)[:, seen] @ _inverse(V[np.ix_(seen, seen)])
-        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.T) @ self.A.T
-        return gain, V, (P + P.T) / 2
+        known = V * seen[..., None] * seen[..., None, :]
+        inverse = _inverse(known)
+        # In directions without variance the steady gain holds.
+        gain = (P @ C.T + L @ S) @ inverse + L @ (
+            seen[..., None] * np.eye(len(C)) - known @ inverse
+        )
+        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.swapaxes(-1, -2)) @ self.A.T
+        return gain, V, (P + P.swapaxes(-1, -2)) / 2
 
     def gains(self, steps: int) -> Array:
         """Return the gains L_0, L_1, .. from P0 ``(steps', n, n_y)``, at most ``steps`` of them.
@@ -80,26 +87,26 @@ class Innovations(NamedTuple):
         return np.array(gains).reshape(-1, *self.L.shape)
 
     def estimates(self, y: Array, u: Array, d: Array) -> Array:
-        r"""Return \xi_0, .., \xi_T ``(T + 1, n)`` of one trajectory.
+        r"""Return \xi_0, .., \xi_T ``(*batch, T + 1, n)`` of trajectories of equal length.
 
         Args:
-            y: outputs ``(T + 1, n_y)``; an entry that is NaN was not measured.
-            u: inputs ``(T, n_u)``.
-            d: known signals ``(T, n_d)``.
+            y: outputs ``(*batch, T + 1, n_y)``; an entry that is NaN was not measured.
+            u: inputs ``(*batch, T, n_u)``.
+            d: known signals ``(*batch, T, n_d)``.
         """
-        seen = np.isfinite(y)
-        whole, inputs = seen.all(), self.inputs(u, d)
-        gains = self.gains(len(y)) if whole else ()
-        xi, P, x = np.empty((len(y), len(self.A))), self.P0, self.x0
-        for k in range(len(y)):
+        seen, inputs = np.isfinite(y), self.inputs(u, d)
+        whole = seen.all()
+        gains = self.gains(y.shape[-2]) if whole else ()
+        xi, P, x = np.empty((*y.shape[:-1], len(self.A))), self.P0, self.x0
+        for k in range(y.shape[-2]):
+            e = np.where(seen[..., k, :], y[..., k, :] - x @ self.C.T, 0.0)
             if whole:
-                gain = gains[k] if k < len(gains) else self.L
+                xi[..., k, :] = x + e @ (gains[k] if k < len(gains) else self.L).T
             else:
-                gain, _, P = self.gain(P, seen[k])
-            e = np.where(seen[k], y[k] - self.C @ x, 0.0)
-            xi[k] = x + gain @ e
-            if k < len(inputs):
-                x = self.A @ xi[k] + inputs[k]
+                gain, _, P = self.gain(P, seen[..., k, :])
+                xi[..., k, :] = x + (gain @ e[..., None])[..., 0]
+            if k < inputs.shape[-2]:
+                x = xi[..., k, :] @ self.A.T + inputs[..., k, :]
         return xi
 
     def inputs(self, u: Array, d: Array) -> Array:
@@ -107,16 +114,17 @@ class Innovations(NamedTuple):
         return u @ self.B.T + d @ self.E.T + self.offset
 
     def errors(self, y: Array, u: Array, d: Array, horizon: int) -> Array:
-        """Return y_{k+h} minus its prediction from the estimate at k, ``(T, horizon, n_y)``.
+        """Return y_{k+h} minus its prediction from the estimate at k, in `estimates`' shapes.
 
-        It is NaN after the end of the trajectory, and where the output was not measured.
+        It is NaN after the end of the trajectory, and where the output was not measured:
+        ``(*batch, T, horizon, n_y)``.
         """
-        steps = len(u)
-        errors = np.full((steps, horizon, len(self.C)), np.nan)
-        x, inputs = self.estimates(y, u, d)[:-1], self.inputs(u, d)
+        steps, inputs = u.shape[-2], self.inputs(u, d)
+        errors = np.full((*u.shape[:-1], horizon, len(self.C)), np.nan)
+        x = self.estimates(y, u, d)[..., :-1, :]
         for h in range(min(horizon, steps)):
-            x = x[: steps - h] @ self.A.T + inputs[h:]
-            errors[: steps - h, h] = y[h + 1 :] - x @ self.C.T
+            x = x[..., : steps - h, :] @ self.A.T + inputs[..., h:, :]
+            errors[..., : steps - h, h, :] = y[..., h + 1 :, :] - x @ self.C.T
         return errors
 
     def transformed(self, T: Array, inverse: Array, shift: Array) -> Innovations:
@@ -128,7 +136,8 @@ class Innovations(NamedTuple):
 
 
 def _inverse(V: Array) -> Array:
-    """Return the pseudoinverse of a covariance, in unit variances."""
-    size = np.sqrt(np.maximum(np.diag(V), 0))
+    """Return the pseudoinverse of covariances, in unit variances."""
+    size = np.sqrt(np.maximum(np.diagonal(V, axis1=-2, axis2=-1), 0))
     scale = np.divide(1, size, out=np.zeros_like(size), where=size > 0)
-    return scale[:, None] * np.linalg.pinv(scale[:, None] * V * scale, SINGULAR, True) * scale
+    scale = scale[..., None] * scale[..., None, :]
+    return scale * np.linalg.pinv(scale * V, SINGULAR, True)

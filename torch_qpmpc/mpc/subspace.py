@@ -21,16 +21,60 @@ import scipy.linalg
 import torch
 
 from torch_qpmpc.mpc.innovations import Array, Innovations
-from torch_qpmpc.mpc.log import Trajectory
+from torch_qpmpc.mpc.log import Trajectory, folds
 from torch_qpmpc.mpc.ridge import ridge
 
-#: Iterations of expectation maximisation, and the gain of the log-likelihood per step that ends it.
-ITERATIONS, STALLED = 20, 1e-5
+#: Iterations of expectation maximisation, of a candidate and of the fit, and the gain of the
+#: log-likelihood per step that ends them.
+FEW, MANY, STALLED = 5, 20, 1e-5
+#: A covariance that changes by less than this share has settled.
+SAME = 1e-8
 #: The least variances of the noise of normalised states and outputs.
 FLOOR_Q, FLOOR_R = 1e-12, 1e-8
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
+#: Candidates, as far as the data allow; 0 states are the outputs alone.
+ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20), (2, 5, 10, 20)
+#: Parts of the log in cross-validation.
+PARTS = 2
+#: Steps of the predictions that decide.
+HORIZONS = (1, 2, 5, 10, 20)
+#: The smallest order is chosen whose squared errors are above the best's by less than this share,
+#: in the geometric mean. Errors below EXACT, as a share of the variance, are none.
+MARGIN, EXACT = 0.03, 1e-8
+#: Autocorrelations of the residuals in the test of whiteness.
+CORRELATIONS = 20
+
+
+class Candidate(NamedTuple):
+    """An order and lags, and the mean logarithm of held-out squared errors of unit variances."""
+
+    order: int
+    lags: int
+    score: float
+
+
+class Fit(NamedTuple):
+    """An identified model, and how it was chosen.
+
+    Attributes:
+        model: the model.
+        order, lags: as in `fit_state_space`.
+        candidates: those that were compared.
+    """
+
+    model: Innovations
+    order: int
+    lags: int
+    candidates: tuple[Candidate, ...] = ()
+
+
+class Signals(NamedTuple):
+    """Normalised outputs ``(*batch, T + 1, n_y)`` and [u, d, 1] ``(*batch, T, n_v)``."""
+
+    y: Array
+    v: Array
 
 
 class Noisy(NamedTuple):
@@ -45,111 +89,201 @@ class Noisy(NamedTuple):
     P0: Array
 
 
-class Fit(NamedTuple):
-    """An identified model, and how it was chosen.
-
-    Attributes:
-        model: the model.
-        order, lags: as in `fit_state_space`.
-    """
-
-    model: Innovations
-    order: int | None
-    lags: int
-
-
-class Signals(NamedTuple):
-    """One trajectory of normalised outputs ``(T + 1, n_y)`` and of [u, d, 1] ``(T, n_v)``."""
-
-    y: Array
-    v: Array
-
-
-class Scale(NamedTuple):
-    """The means and sizes of outputs and of [u, d]."""
-
-    y: Array
-    y_size: Array
-    v: Array
-    v_size: Array
-
-
 def fit_state_space(
-    trajectories: Sequence[Trajectory], order: int | None = None, lags: int = 10
+    trajectories: Sequence[Trajectory], order: int | None = None, lags: int | None = None
 ) -> Fit:
     """Fit an innovations form to a log, whose first states are the outputs.
 
+    Order and lags have the least multi-step errors in parts of the log that a fit has not seen; of
+    orders that are nearly as good, the smallest.
+
     Args:
         trajectories: the log; outputs that are NaN were not measured.
-        order: states of the likelihood's model; None for the outputs alone, each measured exactly.
+        order: states of the likelihood's model; 0 for the outputs alone, each measured exactly.
+            The innovations form has more if the outputs are not independent functions of them.
         lags: lags of the ARX model of the start.
     """
-    y, u, d = ([part.numpy() for part in parts] for parts in zip(*trajectories, strict=True))
-    low, high = (np.array([f.reduce(x) for x in y]) for f in (np.fmin, np.fmax))
-    still, n_u = np.asarray(~(high > low).any(0)), u[0].shape[1]
-    held = np.where(np.isfinite(high), high, np.nanmean(high, 0))[:, still]
-    rows = [np.hstack((b, c, np.tile(a, (len(b), 1)))) for a, b, c in zip(held, u, d, strict=True)]
-    scale = Scale(*_scale(np.concatenate([x[:, ~still] for x in y])), *_scale(np.concatenate(rows)))
-    data = []
-    for a, b in zip(y, rows, strict=True):
-        v = np.hstack(((b - scale.v) / scale.v_size, np.ones((len(b), 1))))
-        data.append(Signals((a[:, ~still] - scale.y) / scale.y_size, v))
-    par = None if order is None else start(data, order, lags)
-    model = measured(data) if par is None else readable(em(par, data), data)
-    return Fit(_with_still(_in_units(model, scale), held, still, n_u), order, lags)
+    normal = _Normal(trajectories)
+    data, rows = normal.apply(trajectories), ()
+    if order is None or (lags is None and order):
+        orders = ORDERS if order is None else (order,)
+        feasible = _feasible(data) if lags is None else (lags,)
+        parts = [normal.apply(part) for part in folds(trajectories, PARTS)]
+        rows = tuple(_compare(parts, orders, feasible, order is None))
+        order, lags = _best(rows)[:2]
+    if order:
+        par = em(_states(_predictor(data, lags or 0), order), data, MANY)
+        model = readable(steady(par), data)
+    else:
+        model = measured(data)
+    return Fit(normal.restore(model), order, lags or 0, rows)
+
+
+def held_out_errors(
+    trajectories: Sequence[Trajectory], order: int, lags: int, horizon: int, count: int = PARTS
+) -> Array:
+    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their part."""
+    parts, errors = folds(trajectories, count), []
+    for i, part in enumerate(parts):
+        model = fit_state_space([x for j, p in enumerate(parts) if j != i for x in p], order, lags)[
+            0
+        ]
+        errors += [
+            model.errors(one.y.numpy(), one.u.numpy(), one.d.numpy(), horizon) for one in part
+        ]
+    return np.concatenate(errors)
+
+
+def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
+    """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
+    errors = [
+        model.errors(one.y.numpy(), one.u.numpy(), one.d.numpy(), 1)[:, 0] for one in trajectories
+    ]
+    mean = np.nanmean(np.concatenate(errors), 0)
+    inside = []
+    for lag in range(1, CORRELATIONS + 1):
+        pairs = np.concatenate([(e[lag:] - mean) * (e[:-lag] - mean) for e in errors])
+        count = np.isfinite(pairs).sum(0)
+        size = np.nanvar(np.concatenate(errors), 0) * 1.96 * np.sqrt(np.maximum(count, 1))
+        inside.append(np.abs(np.nansum(pairs, 0)) <= size)
+    return np.mean(inside, 0)
+
+
+# The choice
+
+
+def _feasible(data: Sequence[Signals]) -> tuple[int, ...]:
+    """Return the lags whose windows are in at least half of the steps."""
+    total = sum(len(v) for _, v in data)
+    usable = {p: sum(max(len(v) - p, 0) for _, v in data) for p in LAGS}
+    width = data[0].y.shape[1] + data[0].v.shape[1]
+    return tuple(p for p in LAGS if usable[p] >= max(total / 2, 2 * width))[-3:]
+
+
+def _compare(
+    parts: list[list[Signals]], orders: Sequence[int], lags: Sequence[int], alone: bool
+) -> list[Candidate]:
+    """Return the candidates with their scores; ``alone`` are the outputs without a filter, too."""
+    folds = [
+        ([x for j, p in enumerate(parts) if j != i for x in p], _batches(part))
+        for i, part in enumerate(parts)
+    ]
+    rows = []
+    if alone or not lags:
+        rows.append(Candidate(0, 0, _score([measured(data) for data, _ in folds], folds)))
+        if rows[0].score <= np.log(EXACT) + MARGIN:
+            return rows
+    for p in lags:
+        starts = [_predictor(data, p) for data, _ in folds]
+        for n in orders:
+            if n <= min(len(start.s) for start in starts):
+                pairs = zip(starts, folds, strict=True)
+                models = [steady(em(_states(start, n), data, FEW)) for start, (data, _) in pairs]
+                rows.append(Candidate(n, p, _score(models, folds)))
+    return rows
+
+
+def _score(models: list[Innovations], folds: list) -> float:
+    """Return the mean logarithm of the squared errors of all horizons and outputs."""
+    last, total, count = max(HORIZONS), np.zeros(()), np.zeros(())
+    for model, (_, batches) in zip(models, folds, strict=True):
+        for (y, v), _ in batches:
+            errors = model.errors(y, v, v[..., :0], last)[..., np.array(HORIZONS) - 1, :]
+            errors = errors.reshape(-1, *errors.shape[-2:])
+            total = total + np.nansum(errors**2, 0)
+            count = count + np.isfinite(errors).sum(0)
+    return float(np.log(np.maximum(total[count > 0] / count[count > 0], EXACT)).mean())
+
+
+def _best(rows: Sequence[Candidate]) -> Candidate:
+    limit = min(row.score for row in rows) + MARGIN
+    return min((row for row in rows if row.score <= limit), key=lambda row: (row.order, row.score))
+
+
+# Normalised signals
+
+
+class _Normal:
+    """Outputs, inputs and known signals of unit variance.
+
+    Outputs that never change in a trajectory are known signals of the others.
+    """
+
+    def __init__(self, trajectories: Sequence[Trajectory]) -> None:
+        y = [x.y.numpy() for x in trajectories]
+        low, high = (np.array([f.reduce(x) for x in y]) for f in (np.fmin, np.fmax))
+        self.still = np.asarray(~(high > low).any(0))
+        self.held = np.where(np.isfinite(high), high, np.nanmean(high, 0))[:, self.still]
+        self.n_u = trajectories[0].u.shape[1]
+        self.y, self.y_size = _scale(np.concatenate(y)[:, ~self.still])
+        self.v, self.v_size = _scale(np.concatenate([self._known(x) for x in trajectories]))
+
+    def _known(self, one: Trajectory) -> Array:
+        y, u, d = (x.numpy() for x in one)
+        held = np.fmax.reduce(y[:, self.still])
+        held = np.where(np.isfinite(held), held, self.held.mean(0))
+        return np.hstack((u, d, np.tile(held, (len(u), 1))))
+
+    def apply(self, trajectories: Sequence[Trajectory]) -> list[Signals]:
+        """Return the signals."""
+        data = []
+        for one in trajectories:
+            v = (self._known(one) - self.v) / self.v_size
+            y = (one.y.numpy()[:, ~self.still] - self.y) / self.y_size
+            data.append(Signals(y, np.hstack((v, np.ones((len(v), 1))))))
+        return data
+
+    def restore(self, model: Innovations) -> Innovations:
+        """Return a model of normalised signals, whose B has the columns of v and 1, in units."""
+        n_y, n, n_v = len(self.y), len(model.A), len(self.v)
+        size, shift = np.ones(n), np.zeros(n)
+        size[:n_y], shift[:n_y] = self.y_size, self.y
+        B = model.B[:, :n_v] / self.v_size
+        offset = model.B[:, n_v] - B @ self.v
+        # The origin of hidden states is free: where they rest without an input if y = 0.
+        move, level = np.eye(n) - model.A, shift / size
+        shift[n_y:] = np.linalg.lstsq(move[:, n_y:], -offset - move @ level, rcond=1e-9)[0]
+        S = self.y_size[:, None] * model.S * self.y_size
+        C, L = self.y_size[:, None] * model.C, model.L / self.y_size
+        model = model._replace(B=B, offset=offset, C=C, L=L, S=S)
+        return self._with_still(model.transformed(np.diag(size), np.diag(1 / size), shift))
+
+    def _with_still(self, model: Innovations) -> Innovations:
+        """Return the model with outputs that never change, as states that stay."""
+        n_y, n, count = len(self.still), len(model.A), int(self.still.sum())
+        n_d = model.B.shape[1] - self.n_u - count
+        outputs = np.argsort(
+            np.concatenate((np.flatnonzero(~self.still), np.flatnonzero(self.still)))
+        )
+        hidden = np.arange(n_y - count, n)
+        states = np.concatenate(
+            (np.where(outputs < n_y - count, outputs, outputs + len(hidden)), hidden)
+        )
+        one, zero = np.eye(count), np.zeros((count, count))
+
+        def joined(M: Array, other: Array) -> Any:
+            return scipy.linalg.block_diag(M, other)
+
+        A = joined(model.A, one)
+        A[:n, n:] = model.B[:, self.n_u + n_d :]
+        B = np.pad(model.B, ((0, count), (0, 0)))[states]
+        spread = np.cov(self.held.T, bias=True).reshape(count, count)
+        return Innovations(
+            A[np.ix_(states, states)],
+            B[:, : self.n_u],
+            B[:, self.n_u : self.n_u + n_d],
+            np.pad(model.offset, (0, count))[states],
+            np.eye(n_y, n + count),
+            joined(model.L, one)[np.ix_(states, outputs)],
+            joined(model.S, zero)[np.ix_(outputs, outputs)],
+            np.concatenate((model.x0, self.held.mean(0)))[states],
+            joined(model.P0, spread)[np.ix_(states, states)],
+        )
 
 
 def _scale(x: Array) -> tuple[Array, Array]:
     mean, size = np.nanmean(x, 0), np.nanstd(x, 0)
     return mean, np.where(size > 1e-12 * np.abs(mean), size, 1.0)
-
-
-def _in_units(model: Innovations, scale: Scale) -> Innovations:
-    """Return a model of normalised signals in their units; `E` is [E, offset] before."""
-    n_y, n, n_v = len(scale.y), len(model.A), len(scale.v)
-    size, shift = np.ones(n), np.zeros(n)
-    size[:n_y], shift[:n_y] = scale.y_size, scale.y
-    B = model.B[:, :n_v] / scale.v_size
-    S = scale.y_size[:, None] * model.S * scale.y_size
-    L = model.L / scale.y_size
-    offset = model.B[:, n_v] - B @ scale.v
-    # The origin of hidden states is free: where they rest without an input if y = 0.
-    move, level = np.eye(n) - model.A, shift / size
-    shift[n_y:] = np.linalg.lstsq(move[:, n_y:], -offset - move @ level, rcond=1e-9)[0]
-    model = model._replace(B=B, offset=offset, S=S, L=L)
-    C = scale.y_size[:, None] * model.C
-    return model._replace(C=C).transformed(np.diag(size), np.diag(1 / size), shift)
-
-
-def _with_still(model: Innovations, held: Array, still: Array, n_u: int) -> Innovations:
-    """Return the model with outputs that never change in a trajectory, as states that stay."""
-    n_y, n, count = len(still), len(model.A), int(still.sum())
-    n_d = model.B.shape[1] - n_u - count
-    outputs = np.argsort(np.concatenate((np.flatnonzero(~still), np.flatnonzero(still))))
-    hidden = np.arange(n_y - count, n)
-    states = np.concatenate(
-        (np.where(outputs < n_y - count, outputs, outputs + len(hidden)), hidden)
-    )
-    one, zero = np.eye(count), np.zeros((count, count))
-
-    def joined(M: Array, other: Array) -> Any:
-        return scipy.linalg.block_diag(M, other)
-
-    A = joined(model.A, one)
-    A[:n, n:] = model.B[:, n_u + n_d :]
-    B = np.pad(model.B, ((0, count), (0, 0)))[states]
-    spread = np.cov(held.T, bias=True).reshape(count, count)
-    return Innovations(
-        A[np.ix_(states, states)],
-        B[:, :n_u],
-        B[:, n_u : n_u + n_d],
-        np.pad(model.offset, (0, count))[states],
-        np.eye(n_y, n + count),
-        joined(model.L, one)[np.ix_(states, outputs)],
-        joined(model.S, zero)[np.ix_(outputs, outputs)],
-        np.concatenate((model.x0, held.mean(0)))[states],
-        joined(model.P0, spread)[np.ix_(states, states)],
-    )
 
 
 # Starts
@@ -163,47 +297,58 @@ def measured(data: Sequence[Signals]) -> Innovations:
     whole = np.isfinite(X).all(1) & np.isfinite(Y).all(1)
     W = ridge(torch.as_tensor(X[whole]), torch.as_tensor(Y[whole])).numpy().T
     e = Y[whole] - X[whole] @ W.T
-    S, one = e.T @ e / len(e), np.eye(n)
+    S, one, none = e.T @ e / len(e), np.eye(n), np.zeros((n, 0))
     first = np.array([y[0] for y, _ in data])
     first = first[np.isfinite(first).all(1)]
     P0 = np.cov(first.T, bias=True).reshape(n, n) - S
-    none = np.zeros((n, 0))
     return Innovations(W[:, :n], W[:, n:], none, np.zeros(n), one, one, S, first.mean(0), P0)
 
 
-def start(data: Sequence[Signals], order: int, lags: int) -> Noisy:
-    """Return a model by PBSID."""
+class _Predictor(NamedTuple):
+    """Windows of p steps, the steps after them, and the directions that predict the most."""
+
+    windows: list[Array]
+    after: list[Signals]
+    Vh: Array
+    s: Array
+    G: Array
+    first: Array
+
+
+def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
+    """Fit an ARX model of ``lags`` and decompose its predictions of as many steps."""
     n_y = data[0].y.shape[1]
     filled = [Signals(_filled(y), v) for y, v in data]
-    rows = [np.hstack((y[:-1], v[:, :-1])) for y, v in filled]
-    q = rows[0].shape[1]
-
-    def windows(w: Array) -> Array:
-        n = len(w) - lags + 1
-        return np.stack([w[i : i + n] for i in range(lags)], 1).reshape(n, -1)
-
-    use = [i for i, w in enumerate(rows) if len(w) >= lags]
-    Z = [windows(rows[i]) for i in use]
-    Zs, F = np.concatenate(Z), np.concatenate([filled[i].y[lags:] for i in use])
-    one = np.hstack((Zs, np.ones((len(Zs), 1))))
-    W = ridge(torch.as_tensor(one), torch.as_tensor(F)).numpy()[:-1].T
-    G = np.zeros((lags * n_y, lags * q))
+    windows, after = [], []
+    for y, v in filled:
+        if len(v) >= lags:
+            w = np.hstack((y[:-1], v[:, :-1]))
+            count = len(w) - lags + 1
+            windows.append(np.hstack([w[i : i + count] for i in range(lags)]))
+            after.append(Signals(y[lags:], v[lags:]))
+    Z, F = np.concatenate(windows), np.concatenate([y for y, _ in after])
+    W = ridge(torch.as_tensor(np.hstack((Z, np.ones((len(Z), 1))))), torch.as_tensor(F)).numpy()
+    G, q = np.zeros((lags * n_y, Z.shape[1])), Z.shape[1] // lags
     for f in range(lags):
-        G[f * n_y : (f + 1) * n_y, f * q :] = W[:, : (lags - f) * q]
-    _, s, Vh = np.linalg.svd(np.linalg.qr(Zs, mode="r") @ G.T, full_matrices=False)
-    T = Vh[:order] / (s[:order, None] / np.sqrt(len(Zs))) @ G
-    X = [z @ T.T for z in Z]
-    V = np.concatenate(
-        [np.hstack((x[:-1], filled[i].v[lags:])) for x, i in zip(X, use, strict=True)]
-    )
+        G[f * n_y : (f + 1) * n_y, f * q :] = W[: (lags - f) * q].T
+    _, s, Vh = np.linalg.svd(np.linalg.qr(Z, mode="r") @ G.T, full_matrices=False)
+    s = s[s > 1e-9 * s[0]] / np.sqrt(len(Z))
+    return _Predictor(windows, after, Vh, s, G, np.mean([y[0] for y, _ in filled], 0))
+
+
+def _states(predictor: _Predictor, order: int) -> Noisy:
+    """Return the model of the first ``order`` directions, by least squares."""
+    windows, after, Vh, s, G, first = predictor
+    T = (Vh[:order] / s[:order, None]) @ G
+    X, F = [z @ T.T for z in windows], np.concatenate([y for y, _ in after])
+    V = np.concatenate([np.hstack((x[:-1], v)) for x, (_, v) in zip(X, after, strict=True)])
     X1, X0 = np.concatenate([x[1:] for x in X]), np.concatenate(X)
     AB = np.linalg.lstsq(V, X1, rcond=None)[0].T
     C = np.linalg.lstsq(X0, F, rcond=None)[0].T
     w, r = X1 - V @ AB.T, F - X0 @ C.T
     Q = w.T @ w / len(w) + 1e-6 * np.eye(order)
-    R = r.T @ r / len(r) + 1e-9 * np.eye(n_y)
-    m0 = np.linalg.pinv(C) @ np.mean([y[0] for y, _ in filled], 0)
-    return Noisy(AB[:, :order], AB[:, order:], C, Q, R, m0, np.eye(order))
+    R = r.T @ r / len(r) + 1e-9 * np.eye(len(C))
+    return Noisy(AB[:, :order], AB[:, order:], C, Q, R, np.linalg.pinv(C) @ first, np.eye(order))
 
 
 def _filled(y: Array) -> Array:
@@ -219,7 +364,10 @@ def _filled(y: Array) -> Array:
 
 
 class _Moments(NamedTuple):
-    """Smoothed means ``(G, T + 1, n)``, their covariances and those of neighbours."""
+    """Smoothed means ``(G, T + 1, n)``, their covariances and those of neighbours.
+
+    Without missing samples all G trajectories have the same covariances, ``(T + 1, 1, n, n)``.
+    """
 
     x: Array
     P: Array
@@ -228,64 +376,70 @@ class _Moments(NamedTuple):
 
 
 def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
-    """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``, which share covariances."""
+    """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``; None if all is ``seen``."""
     A, B, C, Q, R, m, P = par
     G, N, n = len(y), y.shape[1], len(A)
-    m = np.broadcast_to(m, (G, n))
+    g = 1 if seen is None else G
+    m, P = np.broadcast_to(m, (G, n)), np.broadcast_to(P, (g, n, n))
     prior, post = np.empty((N, G, n)), np.empty((N, G, n))
-    before, after = np.empty((N, n, n)), np.empty((N, n, n))
-    last, value, inputs = None, 0.0, np.moveaxis(v @ B.T, 0, 1)
-    same = np.zeros(N, dtype=bool)
-    L = inverse = half = np.zeros(0)
+    before, after = np.empty((N, g, n, n)), np.empty((N, g, n, n))
+    same, value, inputs = np.zeros(N, dtype=bool), 0.0, np.moveaxis(v @ B.T, 0, 1)
+    L = inverse = half = Ct = np.zeros(0)
     for t in range(N):
         if t:
-            m = post[t - 1] @ A.T + inputs[t - 1]
-            P = A @ after[t - 1] @ A.T + Q
+            m, P = post[t - 1] @ A.T + inputs[t - 1], A @ after[t - 1] @ A.T + Q
         prior[t], before[t] = m, P
-        e, Ct = y[:, t] - m @ C.T, C
-        if seen is not None:
-            e, Ct, last = np.where(seen[t], e, 0.0), C * seen[t][:, None], None
-        if last is None or np.abs(P - last).max() > 1e-10 * np.abs(P).max():
-            V = Ct @ P @ Ct.T + R
-            inverse = np.linalg.inv(V)
-            half = np.linalg.slogdet(V)[1]
-            L = P @ Ct.T @ inverse
-            after[t] = P - L @ V @ L.T
-            after[t] = (after[t] + after[t].T) / 2
+        e = y[:, t] - m @ C.T
+        if seen is not None or t < 2 or np.abs(P - before[t - 1]).max() > SAME * np.abs(P).max():
+            if seen is not None:
+                e = np.where(seen[:, t], e, 0.0)
+            Ct = C if seen is None else C * seen[:, t, :, None]
+            V = Ct @ P @ Ct.swapaxes(-1, -2) + R
+            inverse, half = np.linalg.inv(V), np.linalg.slogdet(V)[1].sum() * G / g
+            L = P @ Ct.swapaxes(-1, -2) @ inverse
+            P = P - L @ V @ L.swapaxes(-1, -2)
+            after[t] = (P + P.swapaxes(-1, -2)) / 2
         else:
             before[t], after[t], same[t] = before[t - 1], after[t - 1], True
-        last = before[t]
-        post[t] = m + e @ L.T
-        value -= (G * half + np.einsum("gi,ij,gj", e, inverse, e)) / 2
-    x, Ps, cross = post, after.copy(), np.empty((N - 1, n, n))
-    J = np.zeros(0)
+        post[t] = m + _apply(L, e)
+        value -= (half + (_apply(inverse, e) * e).sum()) / 2
+    x, Ps, cross, J = post, after.copy(), np.empty((N - 1, g, n, n)), np.zeros(0)
     for t in range(N - 2, -1, -1):
         if t == N - 2 or not same[t + 1]:
-            J = np.linalg.solve(before[t + 1], A @ after[t]).T
-        x[t] += (x[t + 1] - prior[t + 1]) @ J.T
-        Ps[t] += J @ (Ps[t + 1] - before[t + 1]) @ J.T
-        cross[t] = Ps[t + 1] @ J.T
-    return _Moments(np.moveaxis(x, 0, 1), Ps, cross, value)
+            J = np.linalg.solve(before[t + 1], A @ after[t]).swapaxes(-1, -2)
+        x[t] += _apply(J, x[t + 1] - prior[t + 1])
+        Ps[t] += J @ (Ps[t + 1] - before[t + 1]) @ J.swapaxes(-1, -2)
+        cross[t] = Ps[t + 1] @ J.swapaxes(-1, -2)
+    return _Moments(np.moveaxis(x, 0, 1), Ps, cross, float(value))
 
 
-def em(par: Noisy, data: Sequence[Signals], iterations: int = ITERATIONS) -> Noisy:
-    """Raise the likelihood by expectation maximisation."""
-    groups: dict[tuple[int, bytes], list[Signals]] = defaultdict(list)
+def _apply(M: Array, x: Array) -> Array:
+    """Return the products of x ``(G, n)`` with matrices of each, or with the one of all."""
+    return x @ M[0].T if len(M) == 1 else (M @ x[..., None])[..., 0]
+
+
+def _batches(data: Sequence[Signals]) -> list[tuple[Signals, Array | None]]:
+    """Return trajectories of the same length together, and which samples are there if any lack."""
+    groups: dict[tuple[int, bool], list[Signals]] = defaultdict(list)
     for y, v in data:
-        missing = np.isnan(y)
-        groups[len(v), missing.tobytes() if missing.any() else b""].append(Signals(y, v))
+        groups[len(v), bool(np.isnan(y).any())].append(Signals(y, v))
     batches = []
-    for (_, mark), members in groups.items():
-        y = np.stack([y for y, _ in members])
-        seen = np.isfinite(y[0]) if mark else None
-        batches.append((np.nan_to_num(y), np.stack([v for _, v in members]), seen))
-    n, steps, before = len(par.A), sum(len(y) for y, _ in data), -np.inf
+    for (_, missing), group in groups.items():
+        y, v = (np.stack(parts) for parts in zip(*group, strict=True))
+        batches.append((Signals(y, v), np.isfinite(y) if missing else None))
+    return batches
+
+
+def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
+    """Raise the likelihood by expectation maximisation."""
+    batches, before = _batches(data), -np.inf
+    steps = sum(len(y) for y, _ in data)
     for _ in range(iterations):
-        moments = [smooth(par, *batch) for batch in batches]
+        moments = [smooth(par, np.nan_to_num(y), v, seen) for (y, v), seen in batches]
         value = sum(m.likelihood for m in moments) / steps
         if value - before < STALLED:
             break
-        before, par = value, _maximise(par, batches, moments, n)
+        before, par = value, _maximise(par, batches, moments, len(par.A))
     return par
 
 
@@ -293,28 +447,30 @@ def _maximise(par: Noisy, batches: list, moments: list[_Moments], n: int) -> Noi
     Szz: Any = 0.0
     Sx1 = S11 = Syx = Sxx = Syy = first = Szz
     N = M = 0
-    for (y, v, seen), (x, P, cross, _) in zip(batches, moments, strict=True):
-        G = len(y)
+    for ((y, v), seen), (x, P, cross, _) in zip(batches, moments, strict=True):
+        G = len(y) / P.shape[1]
         z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
         x1, all_x, ys = x[:, 1:].reshape(-1, n), x.reshape(-1, n), y.reshape(-1, y.shape[-1])
         zz, xz = z.T @ z, x1.T @ z
-        zz[:n, :n] += G * P[:-1].sum(0)
-        xz[:, :n] += G * cross.sum(0)
-        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum(0)
+        zz[:n, :n] += G * P[:-1].sum((0, 1))
+        xz[:, :n] += G * cross.sum((0, 1))
+        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum((0, 1))
         if seen is not None:  # outputs that are missing have their expected moments
-            y = np.where(seen, y, x @ par.C.T)
-            ys = y.reshape(-1, y.shape[-1])
-            for t in np.flatnonzero(~seen.all(1)):
-                gone = ~seen[t]
-                CP = par.C @ P[t]
-                Syx = Syx + G * gone[:, None] * CP
-                Syy = Syy + G * np.outer(gone, gone) * (CP @ par.C.T + par.R)
-        Syx, Sxx, Syy = Syx + ys.T @ all_x, Sxx + all_x.T @ all_x + G * P.sum(0), Syy + ys.T @ ys
+            gone = ~np.moveaxis(seen, 0, 1)[..., None]
+            CP, both = par.C @ P, gone & gone.swapaxes(-1, -2)
+            Syx = Syx + (gone * CP).sum((0, 1))
+            Syy = Syy + (both * (CP @ par.C.T + par.R)).sum((0, 1))
+            ys = np.where(seen, y, x @ par.C.T).reshape(ys.shape)
+        Syx, Sxx, Syy = (
+            Syx + ys.T @ all_x,
+            Sxx + all_x.T @ all_x + G * P.sum((0, 1)),
+            Syy + ys.T @ ys,
+        )
         N, M = N + len(x1), M + len(ys)
     count = sum(len(m.x) for m in moments)
     m0: Any = sum(m.x[:, 0].sum(0) for m in moments) / count
     for m in moments:
-        first = first + (m.x[:, 0] - m0).T @ (m.x[:, 0] - m0) + len(m.x) * m.P[0]
+        first = first + (m.x[:, 0] - m0).T @ (m.x[:, 0] - m0) + len(m.x) * m.P[0].mean(0)
     P0 = first / count
     AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
     C = np.linalg.solve(_lifted(Sxx), Syx.T).T
@@ -332,24 +488,36 @@ def _positive(M: Array, floor: float) -> Array:
     return (v * np.maximum(w, floor)) @ v.T
 
 
-# Coordinates
+# The filter
 
 
-def readable(par: Noisy, data: Sequence[Signals]) -> Innovations:
-    """Return the filter's steady state, with the outputs as the first states."""
+def steady(par: Noisy) -> Innovations:
+    """Return the filter's steady state."""
     A, B, C, Q, R, m0, P0 = par
-    P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    try:
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    except (
+        ValueError,
+        np.linalg.LinAlgError,
+    ):  # a mode that nothing excites: its steady state is far away
+        P = Q
+        for _ in range(1000):
+            P = A @ (P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)) @ A.T + Q
+            P = (P + P.T) / 2
     S = C @ P @ C.T + R
     L = np.linalg.solve(S, C @ P).T
-    none, zero = np.zeros((len(A), 0)), np.zeros(len(A))
-    model = Innovations(A, B, none, zero, C, L, S, m0, P0 - P)
-    xi = np.concatenate([model.estimates(y, v, v[:, :0]) for y, v in data])
-    root = np.linalg.cholesky(np.cov(xi.T, bias=True).reshape(len(A), -1) + 1e-12 * np.eye(len(A)))
+    return Innovations(A, B, np.zeros((len(A), 0)), np.zeros(len(A)), C, L, S, m0, P0 - P)
+
+
+def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
+    """Return the model with the outputs as the first states, and others of unit variance."""
+    n, C = len(model.A), model.C
+    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for (y, v), _ in _batches(data)]
+    cov = np.cov(np.concatenate(xi).T, bias=True).reshape(n, n)
+    root = np.linalg.cholesky(cov + 1e-12 * np.eye(n))
     _, s, Vh = np.linalg.svd(C @ root)
-    shown = int((s > HIDDEN * s[0]).sum())
-    hidden = np.linalg.solve(root.T, Vh[shown:].T).T
+    hidden = np.linalg.solve(root.T, Vh[int((s > HIDDEN * s[0]).sum()) :].T).T
     hidden *= np.sign(hidden[np.arange(len(hidden)), np.abs(hidden).argmax(1)])[:, None]
     T = np.concatenate((C, hidden))
-    inverse = np.linalg.pinv(T)
-    model = model.transformed(T, inverse, np.zeros(len(T)))
+    model = model.transformed(T, np.linalg.pinv(T), np.zeros(len(T)))
     return model._replace(C=np.eye(len(C), len(T)))
