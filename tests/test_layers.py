@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 4041,
     "export": 1412,
     "learning": 2473,
-    "mpc": 5902,
+    "mpc": 5921,
     "proofs": 998,
     "qp": 5766,
     "study": 606,
