@@ -121,7 +121,7 @@ def test_absurd_set_points_and_forecasts_hold_the_input_and_the_estimates_go_on(
 def test_estimates_are_copies():
     controller = tanks()
     controller.step([1.0], [1.0])
-    for name in ("x", "w", "u"):
+    for name in ("x", "w", "u", "r"):
         before = getattr(controller, name).copy()
         getattr(controller, name)[:] = 7.0
         assert np.array_equal(getattr(controller, name), before)
@@ -203,6 +203,40 @@ def test_the_last_input_stands_for_one_that_is_not_known(tmp_path, u):
         assert controller.status == code == (4 if np.isnan(y) else 0)
     assert controller.u[0] == 12.0, "the one above its bound, clipped"
     assert np.allclose(controller.step([10.8], [14.0]), twin.step([10.8], [14.0])[0], atol=1e-12)
+
+
+def test_nothing_winds_up_while_a_set_point_is_out_of_reach_or_the_operator_out_of_bounds():
+    paths = []
+    for waiting in (200, 400):
+        controller, x, path = tanks(), np.array([10.0, 10.0]), []
+        controller.reset(y=[10.0], u=[4.0])
+        for k in range(waiting + 40):
+            x = A @ x + B @ controller.step(x[1:], [50.0 if k < waiting else 14.0])
+            path.append(x[1])
+        paths.append(path[waiting:])
+    assert np.allclose(*paths, atol=1e-6)
+    for u in (20.0, -5.0, 20.0, 30.0):  # by hand, and seen as it was
+        controller.observe(x[1:], [u])
+        x = A @ x + B[:, 0] * u
+    assert np.abs(controller.w).max() < 1e-6
+    assert controller.u[0] == 12.0
+
+
+# Steps without a plan
+
+
+@pytest.mark.parametrize("on_failure", ["raise", "warn", "mask"])
+def test_a_step_without_a_plan_holds_the_input_whatever_the_mpc_does_on_failure(on_failure):
+    hard = {"y_bounds": (-1.0, 1.0), "y_slack": np.inf, "u_bounds": (-1.0, 1.0)}
+    model = ([[0.9, 0.1], [0.0, 0.8]], [[0.0], [0.5]], [[1.0, 0.0]])
+    mpc = qm.LinearMPC(model, 10, Q=1.0, dR=0.1, on_failure=on_failure, **hard)
+    controller = qm.Controller(mpc)
+    controller.reset(u=[0.4])
+    plan = controller.step([0.5], [0.5]), controller.p
+    for y in (3.0, 3.0):
+        assert controller.step([y]) == plan[0]
+        assert controller.status == Outcome.INFEASIBLE
+    assert torch.equal(controller.p, plan[1])
 
 
 # New bounds and weights

@@ -134,7 +134,7 @@ static int plan(policy_state *s, const real known[])
     int i, k, code;
     for (i = 0; i < N_D; i++) {
         for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i];
-        level[i] /= STAGES;
+        level[i] /= (real)STAGES;
     }
     for (k = 0; k < SET_POINTS; k++) {
         if ((code = aim(s, s->r + k * N_Y, level)) != POLICY_SOLVED) return code;
