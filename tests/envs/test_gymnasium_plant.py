@@ -80,7 +80,7 @@ def test_an_unknown_environment_is_an_error(id):
         *(
             (
                 {kind: Box(0, 9, (1,), dtype)},
-                rf"whose {kind} are {dtype.__name__}, expected real numbers. Round in a wrapper",
+                rf"whose {kind} are {dtype.__name__}, expected real numbers. Convert .* Transform",
             )
             for kind in ("actions", "observations")
             for dtype in (np.int64, np.uint8)

@@ -171,7 +171,7 @@ def test_times_are_read_from_a_column_or_the_index(times, place):
     assert (lengths(log), log.dt) == ([19, 29], 900)
 
 
-FORMATS = ("%d/%m/%Y %H:%M", "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%m-%d-%Y %H:%M")
+FORMATS = ("%d/%m/%Y %H:00", "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%d-%m-%Y %H:%M")
 
 
 @pytest.mark.parametrize("text", FORMATS)

@@ -103,7 +103,7 @@ class GymnasiumPlant:
             raise QPError.expected("task.id", got, "Box spaces of one dimension", remedy)
         if not np.issubdtype(space.dtype, np.floating):
             got, want = f"{self.id!r}, whose {name}s are {space.dtype}", "real numbers"
-            remedy = "Round in a wrapper: TransformAction(env, numpy.rint, Box(low, high))."
+            remedy = f"Convert them by a Transform{name.title()} with a Box of floats."
             raise QPError.expected("task.id", got, want, remedy)
         low, high = (torch.as_tensor(x, dtype=torch.float64) for x in (space.low, space.high))
         return low, high

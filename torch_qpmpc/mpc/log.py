@@ -244,9 +244,7 @@ def _split(
     if not len(edges):
         got = f"{len(values)} rows, of which no two in a row are complete"
         raise QPError.expected("data", got, "consecutive rows with a number in each column")
-    used = np.zeros(len(values), dtype=bool)
-    used[:-1] |= steps
-    used[1:] |= steps
+    used = np.concatenate((steps, [False])) | np.concatenate(([False], steps))
     y, u, d = torch.as_tensor(values).split(sizes, dim=1)
     trajectories = [Trajectory(y[i : k + 1], u[i:k], d[i:k]) for i, k in edges.tolist()]
     counted = f"{_count(gaps.sum(), 'gap')}, {_count(len(edges), 'trajectory')}"
@@ -394,8 +392,9 @@ def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.
     times = [(dates - dates.min()).dt.total_seconds().to_numpy() for dates in ways]
     if len(times) == 1 or np.array_equal(*map(np.diff, times), equal_nan=True):
         return times[0]
-    steps = [np.diff(x) / np.nanmedian(np.diff(x)) for x in times]
-    day, month = (np.nanmean(np.abs(x - 1)) for x in steps)
+    changes = [np.diff(x) for x in times]
+    uneven = [np.abs(x - np.nanmedian(x)) / (abs(np.nanmedian(x)) or 1.0) for x in changes]
+    day, month = map(np.nanmean, uneven)
     text = (
         f"The dates in {name} may begin with the day or the month: its steps are more even if it "
         f"is the {'day' if day <= month else 'month'}. Pass day_first={day <= month} if that is so."
