@@ -67,14 +67,14 @@ LAYERS = {
 BUDGET = {
     ".": 433,
     "analysis": 1203,
-    "control": 3892,
-    "envs": 1573,
+    "control": 4070,
+    "envs": 1577,
     "experiment": 4041,
-    "export": 1412,
-    "learning": 2473,
+    "export": 1429,
+    "learning": 2479,
     "mpc": 5921,
     "proofs": 998,
-    "qp": 5766,
+    "qp": 5811,
     "study": 606,
 }
 #: Libraries that only some layers may import.

@@ -223,3 +223,15 @@ def test_signals_that_are_not_those_of_p_are_named(arguments, message):
 def test_set_points_of_another_size_are_named():
     with pytest.raises(QPError, match=r"^r: got shape \(2,\), expected \(\*batch, 1\)"):
         qm.LinearMPC(SCALAR, 3, Q=1.0).target([1.0, 2.0])
+
+
+@pytest.mark.parametrize("inputs", [1, 2])
+def test_the_target_has_a_gradient(inputs):
+    B = [[0.5, 0.4][:inputs]]
+    mpc = qm.LinearMPC(([[0.9]], B), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0), E=[[0.2]], known=["d"])
+    point = [torch.tensor([x], dtype=torch.float64, requires_grad=True) for x in (1.0, 0.3, -0.2)]
+    assert torch.autograd.gradcheck(lambda *point: tuple(mpc.target(*point)), point)
+    out_of_reach = torch.tensor([90.0], dtype=torch.float64, requires_grad=True)
+    mpc.target(out_of_reach).y.sum().backward()
+    assert out_of_reach.grad.abs().max() < 1e-9
+    assert not mpc.target([1.0]).u.requires_grad

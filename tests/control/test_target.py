@@ -34,11 +34,7 @@ def nearest(mpc: qm.LinearMPC, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # Of all u with these outputs: u = u_0 + F f.
     F, R = scipy.linalg.null_space(gain), mpc.design.R
     rows = {"G": np.vstack((F, -F)), "h": np.append(upper - u, u - lower) + 1e-9}
-    small = 1e-3 * np.trace(R)  # of v = [x; u], which the target adds
-    Z = scipy.linalg.null_space(np.hstack((plant.A - np.eye(4), plant.B)))
-    M, to_v = Z[4:].T @ R @ Z[4:] + small * np.eye(4), np.linalg.inv(Z[4:])
-    W = to_v.T @ M @ to_v
-    f = qpsolvers.solve_qp(F.T @ W @ F, F.T @ W @ u, **rows, solver="quadprog")
+    f = qpsolvers.solve_qp(F.T @ R @ F, F.T @ R @ u, **rows, solver="quadprog")
     assert f is not None
     return y, u + F @ f
 

@@ -148,6 +148,18 @@ def test_a_solvers_rounding_reaches_the_plant_as_zero(register):
         assert own.action.dtype == np.float32
 
 
+@pytest.mark.parametrize("most", [1e-9, 1e6, np.inf])
+def test_actions_in_any_unit_reach_the_plant(register, most):
+    bounds = Box(-most, most, (1,), np.float64)
+    env = GymnasiumPlant(register(actions=bounds)).make()
+    own: Any = env.unwrapped
+    env.reset(seed=0)
+    size = most if np.isfinite(most) else 1e-12
+    for share in (0.7, -1e-6):
+        env.step(np.array([share * size]))
+        assert own.action.tolist() == [share * size]
+
+
 @pytest.mark.parametrize("kind", [Dict, Tuple])
 def test_parts_of_an_observation_become_one_vector(monkeypatch, kind):
     class Parts(Counter):

@@ -47,6 +47,16 @@ def test_unusable_pairs_do_not_count():
     assert (weight[~use] == 1).all()
 
 
+def test_units_of_signals_and_costs_change_no_weight():
+    p, a, value, use = pairs()
+    p[:, 1] = 0.3  # a constant entry tells nothing
+    error = a[:, 0] * normal(COUNT, seed=3)
+    weight = inverse_variance(p, a, value, error, use)
+    for unit, cost in ((1e-7, 1e8), (1e6, 1e-12)):
+        other = inverse_variance(p * unit, a / unit, value * cost, error * cost, use)
+        assert_close(other, weight, rtol=1e-4, atol=0)
+
+
 def test_few_pairs_or_errors_of_zero_have_weight_one():
     p, a, value, use = pairs()
     few = slice(0, 15)

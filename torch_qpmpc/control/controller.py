@@ -41,7 +41,8 @@ class Controller:
     Args:
         mpc: the MPC. Call `reset` when its theta has changed.
         noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
-            default a tenth of half the distance of the outputs' bounds, or of one without bounds.
+            default a tenth of half the distance of the outputs' bounds, or without bounds of the
+            deviation that costs one, ``1 / sqrt(Q)``.
         drift: standard deviations of the change of each disturbance in a step; by default a tenth
             of half the distance of the bounds of the output or the input. A larger ratio of drift
             to noise rejects disturbances faster and passes on more noise.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_choice, check_number
-from torch_qpmpc.control.disturbance import Disturbances, Steady
+from torch_qpmpc.control.disturbance import PREFIX, Disturbances, Steady
+from torch_qpmpc.control.scaling import Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
@@ -83,13 +84,55 @@ class Design:
     @property
     def typical(self) -> float:
         """The cost of a stage that is half of the bounds' distance off the target."""
-        y, u = half_range(self.y_bounds), half_range(self.u_bounds)
+        y, u = self.usual, self.scaling.u
         return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u)
+
+    @property
+    def usual(self) -> Array:
+        """Usual deviations of the outputs, ``(n_y,)``.
+
+        They are half the distance of the bounds; without bounds those that cost one; and without a
+        weight the outputs' sizes.
+        """
+        weights = np.diag(self.Q)
+        costly = weights > 0
+        by_weight = np.where(costly, 1 / np.sqrt(np.where(costly, weights, 1.0)), self.scaling.y)
+        half = ranges(self.y_bounds)
+        return np.where(half > 0, half, by_weight)
+
+    @cached_property
+    def scaling(self) -> Scaling:
+        """The sizes of the signals."""
+        return Scaling.of(self.plant, self.y_bounds, self.u_bounds, self.Q, self.horizon)
+
+    @cached_property
+    def normal(self) -> Design:
+        """This design in signals divided by their sizes, with its own prices."""
+        y, u, x, _ = self.scaling
+        w, of_w = self.disturbances, self.of_w(y)
+        half = {"y_bounds": y, "u_bounds": u, "du_bounds": u}
+        return replace(
+            self,
+            plant=self.scaling.plant(self.plant),
+            Q=self.Q * np.outer(y, y),
+            R=self.R * np.outer(u, u),
+            dR=self.dR * np.outer(u, u),
+            y_slack=self.y_slack * y,
+            disturbances=w._replace(B=w.B * (of_w / x[:, None]), C=w.C * (of_w / y[:, None])),
+            **{k: tuple(side / size for side in getattr(self, k)) for k, size in half.items()},
+        )
+
+    def of_w(self, y: Array) -> Array:
+        """Return the sizes of the disturbances, ``(n_w,)``: those of their inputs, or of y."""
+        plant = self.plant
+        sizes = dict(zip((*plant.outputs, *plant.inputs), (*y, *self.scaling.u), strict=True))
+        names = (name.removeprefix(PREFIX) for name in self.disturbances.names)
+        return np.array([sizes[name] for name in names])
 
     @cached_property
     def steady(self) -> Steady:
         """The steady states with the disturbances."""
-        return Steady.of(self.plant, self.disturbances, self.Q, self.R)
+        return Steady.of(self.plant, self.disturbances, self.Q, self.R, self.scaling)
 
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
@@ -124,12 +167,6 @@ class Design:
         places = self.places
         unit = np.eye(places["u"].stop)
         return {name: unit[place] for name, place in places.items()}
-
-
-def half_range(bounds: tuple[Array, Array]) -> Array:
-    """Return half the distance of the bounds, and one where there is none."""
-    half = (bounds[1] - bounds[0]) / 2
-    return np.where(np.isfinite(half) & (half > 0), half, 1.0)
 
 
 def largest(bounds: tuple[Array, Array] | Array) -> Array:

@@ -13,7 +13,7 @@ The steady states (x_s, u_s) for w and known signals d are the affine set
 
 The target is the nearest to the set-point, and the one with the least u_s'R u_s of several. Where
 several have the same outputs with a weight, v = [a; f]: a determines these outputs, and f is the
-distance from the one with the least u_s'R u_s, small multiples of x_s and u_s added.
+distance from the one with the least u_s'R u_s.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 
 #: A singular value below this fraction of the largest is zero.
 RANK = 1e-9
+#: Weighted outputs whose responses differ by a smaller part of them are one.
+FLAT = RANK**0.5
 #: A length that is no divisor.
 TINY = 1e-300
 #: Modes this near to one integrate: an output disturbance is hard to tell from their drift.
 INTEGRATES = 1e-2
-#: The weight of v among steady states with the same outputs, relative to the weight of the inputs.
+#: The least weight of a direction of f, relative to the largest.
 REGULARISATION = 1e-3
-OUTPUT = "output"
+OUTPUT, PREFIX = "output", "disturbance of "
 
 
 class Disturbances(NamedTuple):
@@ -47,11 +50,12 @@ class Disturbances(NamedTuple):
     names: tuple[str, ...]
 
 
-def choose(plant: StateSpace, wanted: Any = "auto") -> Disturbances:
+def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = None) -> Disturbances:
     """Return the disturbances that an observer estimates, one for each output.
 
     Args:
         plant: the model.
+        scaling: the sizes of its signals, by default of a plant without bounds.
         wanted: ``"auto"``: one at an input for each integrating mode, and at the outputs for the
             others. A mapping from outputs to ``"output"`` or the name of an input;
             outputs that are left out have none. None: no disturbances.
@@ -62,23 +66,22 @@ def choose(plant: StateSpace, wanted: Any = "auto") -> Disturbances:
     n, _, n_y, _ = plant.sizes
     if wanted is None:
         return Disturbances(np.zeros((n, 0)), np.zeros((n_y, 0)), ())
-    check_observable(plant)
+    normal = (scaling or Scaling.of(plant)).plant(plant)
+    check_observable(normal)
     if isinstance(wanted, str) and wanted == "auto":
-        placed = _placed(plant, _automatic(plant, INTEGRATES))
-        if _hidden(plant, placed) is None:
-            return placed
-        wanted = _automatic(plant, RANK)
+        wanted = _automatic(normal, INTEGRATES)
+        if _hidden(normal, _placed(normal, wanted)) is not None:
+            wanted = _automatic(normal, RANK)
     elif not isinstance(wanted, Mapping):
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
-    placed = _placed(plant, wanted)
-    if (hidden := _hidden(plant, placed)) is not None:
+    if (hidden := _hidden(normal, _placed(normal, wanted))) is not None:
         got = f"{dict(wanted)}, whose {hidden} cannot be told from a mode at 1"
         remedy = (
             "At an integrating mode take a disturbance of its input, and at others one of the "
             "output; 'auto' chooses so. There can be no more disturbances than outputs."
         )
         raise QPError.expected("disturbances", got, "detectable disturbances", remedy)
-    return placed
+    return _placed(plant, wanted)
 
 
 def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
@@ -92,7 +95,7 @@ def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
         at_output = kind == OUTPUT
         B.append(np.zeros(n) if at_output else plant.B[:, plant.inputs.index(kind)])
         C.append(np.eye(n_y)[plant.outputs.index(output)] if at_output else np.zeros(n_y))
-        names.append(f"disturbance of {output if at_output else kind}")
+        names.append(f"{PREFIX}{output if at_output else kind}")
     return Disturbances(np.array(B).reshape(-1, n).T, np.array(C).reshape(-1, n_y).T, (*names,))
 
 
@@ -142,9 +145,11 @@ def _automatic(plant: StateSpace, tolerance: float) -> dict[str, str]:
     # Output disturbances fill what the other columns leave.
     rest = scipy.linalg.null_space(columns.T, rcond=RANK)[n:].T
     at_outputs, inputs = _independent(rest)[: n_y - len(taken)], iter(taken)
-    return {
-        name: OUTPUT if i in at_outputs else next(inputs) for i, name in enumerate(plant.outputs)
+    kinds = {
+        name: OUTPUT if i in at_outputs else next(inputs, "")
+        for i, name in enumerate(plant.outputs)
     }
+    return {name: kind for name, kind in kinds.items() if kind}
 
 
 def _independent(matrix: Array) -> list[int]:
@@ -162,6 +167,20 @@ def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
     return None if direction is None else placed.names[int(np.abs(direction[n:]).argmax())]
 
 
+def _split(Q: Array, Y: Array) -> tuple[Array, Array]:
+    """Return orthonormal bases of the v for which Y v has a weight in Q, and of those without.
+
+    The sizes of the weights decide nothing.
+    """
+    root = np.sqrt(np.diag(Q))
+    sizes, V = np.linalg.eigh(Q / np.maximum(np.outer(root, root), TINY))
+    rows = (V[:, sizes > RANK].T * root) @ Y
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), FLAT)
+    _, sizes, V = np.linalg.svd(rows)
+    rank = int((sizes > FLAT).sum())
+    return V[:rank].T, V[rank:].T
+
+
 def _number(eigenvalue: complex) -> str:
     return f"{eigenvalue.real:.3g}" + (f"{eigenvalue.imag:+.3g}j" if eigenvalue.imag else "")
 
@@ -171,10 +190,11 @@ class Steady:
     """The steady states of a plant, as linear maps of [w; d; 1].
 
     Attributes:
-        X, U, Y: the maps of v to x_s, u_s and y_s: ``(n, n_v)``, ``(m, n_v)``, ``(n_y, n_v)``.
+        X, U, Y: the maps of v to x_s, u_s and y_s: ``(n, n_v)``, ``(m, n_v)``, ``(n_y, n_v)``. v
+            has no unit; the outputs that f moves have entries in the last columns of Y.
         x, u, y: the maps of [w; d; 1] to them, with n_w + n_d + 1 columns.
-        Q, R: the weights of the target's outputs and inputs; R is the identity in place of zero.
-        W: the weight of f, ``(n_f, n_f)``.
+        W: the weight of f, ``(n_f, n_f)``: that of the inputs, in place of zero their squares
+            relative to their sizes.
     """
 
     X: Array
@@ -183,41 +203,57 @@ class Steady:
     x: Array
     u: Array
     y: Array
-    Q: Array
-    R: Array
     W: Array
 
     @classmethod
-    def of(cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array) -> Steady:
+    def of(
+        cls,
+        plant: StateSpace,
+        w: Disturbances,
+        Q: Array,
+        R: Array,
+        scaling: Scaling | None = None,
+    ) -> Steady:
         """Return the steady states of ``plant`` with disturbances ``w`` and the weights Q and R.
+
+        The sizes of the plant's signals are those of ``scaling``.
 
         Raises:
             QPError: no input moves a mode at one.
         """
         n, m, _, n_d = plant.sizes
-        balance = np.hstack((plant.A - np.eye(n), plant.B))
-        if null_direction(plant.A.T - np.eye(n), plant.B.T) is not None:
+        sizes = scaling or Scaling.of(plant, Q=Q)
+        normal = sizes.plant(plant)
+        balance = np.hstack((normal.A - np.eye(n), normal.B))
+        if null_direction(normal.A.T - np.eye(n), normal.B.T) is not None:
             remedy = "Pass a constant of the model as a known signal, by E."
             got = "a mode at 1 that no input moves"
             raise QPError.expected("model", got, "a model with a steady state", remedy)
         Z = scipy.linalg.null_space(balance, rcond=RANK)
         Z = np.where(np.abs(Z) < RANK, 0.0, Z)  # rounding would let a bound hold by a huge v
-        loads = np.hstack((w.B, plant.E, plant.offset[:, None]))
-        M = -np.linalg.pinv(balance) @ loads
-        y = plant.C @ M[:n] + np.hstack((w.C, np.zeros((len(plant.C), n_d + 1))))
-        R = R if R.any() else np.eye(m)
-        X, U, Y, x, u = Z[:n], Z[n:], plant.C @ Z[:n], M[:n], M[n:]
-        sizes, V = np.linalg.eigh(Y.T @ Q @ Y)
-        free = sizes <= RANK * max(sizes[-1], RANK)
-        W = np.zeros((0, 0))
-        if free.any():
-            F = V[:, free]
-            W = F.T @ U.T @ R @ U @ F + REGULARISATION * np.trace(R) * np.eye(F.shape[1])
+        loads = np.hstack((w.B, plant.E, plant.offset[:, None])) / sizes.x[:, None]
+        M = -np.linalg.pinv(balance, rcond=RANK) @ loads
+        X, U, Y, x, u = Z[:n], Z[n:], normal.C @ Z[:n], M[:n], M[n:]
+        y = normal.C @ x
+        R = R * np.outer(sizes.u, sizes.u) if R.any() else np.eye(m)
+        V, F = _split(Q * np.outer(sizes.y, sizes.y), Y)
+        W = F.T @ U.T @ R @ U @ F
+        if F.size:
+            costs, V_f = np.linalg.eigh(W)
+            least = REGULARISATION * max(costs[-1], RANK * np.linalg.norm(R, 2))
+            W = V_f * np.maximum(costs, least) @ V_f.T
             least = -np.linalg.solve(W, F.T @ U.T @ R)  # f of the least u'R u, for u without it
-            T = np.hstack((V[:, ~free] + F @ least @ U @ V[:, ~free], F))
+            T = np.hstack((V + F @ least @ U @ V, F))
             x, y, u = (of + basis @ F @ least @ u for of, basis in ((x, X), (y, Y), (u, U)))
             X, U, Y = X @ T, U @ T, Y @ T
-        return cls(X, U, Y, x, u, y, Q, R, W)
+            Y[:, -len(W) :][np.abs(Y[:, -len(W) :]) < RANK] = 0.0
+        X, x, U, u, Y, y = (
+            size[:, None] * part
+            for size, parts in ((sizes.x, (X, x)), (sizes.u, (U, u)), (sizes.y, (Y, y)))
+            for part in parts
+        )
+        y = y + np.hstack((w.C, np.zeros((len(w.C), n_d + 1))))
+        return cls(X, U, Y, x, u, y, W)
 
     @property
     def n_a(self) -> int:

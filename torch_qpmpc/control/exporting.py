@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.control.design import half_range, largest
-from torch_qpmpc.control.disturbance import RANK
+from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.simulation import Course, at_rest, centre, last_known, own_loop
@@ -174,7 +173,7 @@ def export_controller(
         state_bytes = library.state_bytes
         own = _run(law, course, start, library.policy, len(loop.u))
         difference = np.abs(own.u - loop.u).max(0)
-        near = NEAR[dtype] * half_range(mpc.design.u_bounds)
+        near = NEAR[dtype] * mpc.design.scaling.u
         if (failed := library.selftest()) or not (difference <= near).all():
             got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
             raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
@@ -211,7 +210,7 @@ def undetermined(mpc: LinearMPC) -> str:
     steady = mpc.design.steady
     if not (len(steady.W) and steady.n_a and mpc.free is None):
         return ""  # else 1 / PREFERENCE is the QP's condition
-    moved = np.abs(steady.Y[:, steady.n_a :]).max(-1) > RANK
+    moved = steady.Y[:, steady.n_a :].any(-1)
     return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
 
 
@@ -231,7 +230,7 @@ def _course(law: Law, known: Array) -> tuple[Course, Array]:
     """
     rng, design = np.random.default_rng(0), law.design
     stages, rows = design.horizon + 1, COMPARED + design.horizon + 1
-    size_y, size_u = half_range(design.y_bounds), half_range(design.u_bounds)
+    size_y, size_u = design.usual, design.scaling.u
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     x, start = at_rest(law.mpc, known)
     d = known + 0.1 * rng.normal(size=(rows, len(known)))
@@ -266,7 +265,7 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
     A controller that is unstable on its own enlarges rounding as its inputs move no plant here.
     """
     rounding = 8 * np.finfo(dtype).eps * np.random.default_rng(0).choice([-1, 1], loop.y.shape)
-    near = 0.01 * NEAR[dtype] * half_range(law.design.u_bounds)
+    near = 0.01 * NEAR[dtype] * law.design.scaling.u
     policy = law.policy(law.begun(loop.start[0]))
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
         move = policy(Signals(y * (1 + rounding[k]), r, known))
@@ -294,7 +293,7 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop) -> dict[str, str]:
         f"EXAMPLE_{key.upper()}": x.reshape(len(x), math.prod(x.shape[1:]))
         for key, x in replayed._asdict().items()
     }
-    examples["NEAR_U"] = NEAR[dtype] * half_range(design.u_bounds)
+    examples["NEAR_U"] = NEAR[dtype] * design.scaling.u
     parts = {
         "/* @HEADER@ */": comment(_signals(law.design.plant, name)),
         "/* @SIZES@ */": defined,
@@ -372,7 +371,7 @@ def _moves(mpc: LinearMPC, dtype: str) -> Array:
         for k in np.flatnonzero((row == G).all(1)):
             bounds[:, i] = [side[k] for side in sides]
     size = largest(bounds)
-    size = np.where(size > 0, size, half_range(design.u_bounds))
+    size = np.where(size > 0, size, design.scaling.u)
     room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(design.u_bounds)
     return bounds + np.array([[-1], [1]]) * room
 
@@ -385,13 +384,13 @@ def _main(law: Law, memory: Memory, name: str, dtype: str) -> str:
     design, known = law.design, last_known(law.design, memory)
     plant, sizes = design.plant, _sizes(law)
     x, u = at_rest(law.mpc, known)
-    load = 0.1 * plant.B @ half_range(design.u_bounds) + plant.E @ known + plant.offset
+    load = 0.1 * plant.B @ design.scaling.u + plant.E @ known + plant.offset
     middle_y, (y_rest, u_rest) = centre(design, known), memory.rest
     if y_rest is not None or u_rest is not None:
         u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
         x = plant.at_rest(u, known, y_rest)
         middle_y = plant.C @ x
-    r = middle_y + 0.25 * half_range(design.y_bounds)
+    r = middle_y + 0.25 * design.usual
     r = np.tile(law.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
     if len(memory.r):
         r = law.read_set_points(None, sizes["SET_POINTS"], memory.r)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, half_range, largest
+from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.observer import ABSURD, SMALL, Observer, kalman, max_plausible, windowed
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
@@ -105,10 +105,8 @@ class Law:
             QPError: a deviation is invalid, or the model has no filter.
         """
         design, w = mpc.design, mpc.design.disturbances
-        y, u = half_range(design.y_bounds), half_range(design.u_bounds)
-        ranges = np.abs(y @ w.C + u @ np.linalg.pinv(design.plant.B) @ w.B)
-        noise = _deviations("noise", noise, SMALL * y, design.plant.outputs)
-        drift = _deviations("drift", drift, SMALL * ranges, w.names)
+        noise = _deviations("noise", noise, SMALL * design.usual, design.plant.outputs)
+        drift = _deviations("drift", drift, SMALL * design.of_w(design.usual), w.names)
         observer = kalman(design, noise, drift)
         largest = max_plausible(design, noise)
         if window:
@@ -175,8 +173,8 @@ class Law:
     @property
     def max_plausible_u(self) -> Array:
         """The largest size of an input that was applied, ``(m,)``."""
-        bounds = self.design.u_bounds
-        return ABSURD * np.maximum(largest(bounds), half_range(bounds))
+        design = self.design
+        return ABSURD * np.maximum(largest(design.u_bounds), design.scaling.u)
 
     def _are_plausible(self, signals: Array, known: int) -> Array:
         """Return the mask of outputs and set-points, or known signals, that may be measurements."""

@@ -17,7 +17,7 @@ import torch
 from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
-from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
@@ -135,7 +135,7 @@ def _environment(
     design: Design, env: Any, middle: Array, known: Any, spread: Any, steps: int
 ) -> Plant:
     """Return loops with an environment, with set-points about the middle."""
-    size = _sizes(design, spread, SMALL * half_range(design.y_bounds))
+    size = _sizes(design, spread, SMALL * design.usual)
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
         return {"known": known, "r": _levels(design, middle, size, steps, rng)}
@@ -236,7 +236,8 @@ def _with_model(law: Law, model: Identified) -> Law:
     """Return the law with another model."""
     old = law.design
     plant = _state_space(model, old)
-    w = choose(plant, "auto" if old.disturbances.names else None)
+    scaling = replace(old, plant=plant).scaling
+    w = choose(plant, "auto" if old.disturbances.names else None, scaling)
     design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC(lowered(design), **{name: law.mpc.arguments[name] for name in KEYWORDS})
     drift = law.drift if w.names == old.disturbances.names else None

@@ -31,12 +31,14 @@ class LinearLoop:
         B: the factors of [load; bias; r], ``(n + n_e + m, m + 2 n_y)``.
         controller: A_c, B_c, C_c and D_c from y to u, with the state [e; u_last].
         plant: A, B and C of the model.
+        units: the sizes of the inputs, ``(m,)``.
     """
 
     A: Array
     B: Array
     controller: tuple[Array, Array, Array, Array]
     plant: tuple[Array, Array, Array]
+    units: Array
 
     @classmethod
     def of(cls, mpc: LinearMPC, observer: Observer, plan: Tables, target: Tables) -> LinearLoop:
@@ -53,7 +55,8 @@ class LinearLoop:
         A = np.block([[plant.A + plant.B @ D_c @ plant.C, plant.B @ C_c], [B_c @ plant.C, A_c]])
         moved = np.hstack((plant.B, plant.B @ D_c, plant.B @ K_r))
         B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, R_c))))
-        return cls(A, B, (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C))
+        parts = (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C)
+        return cls(A, B, *parts, mpc.design.scaling.u)
 
     @property
     def radius(self) -> float:
@@ -84,7 +87,8 @@ class LinearLoop:
             response = outputs @ np.linalg.solve(z - states, inputs)
             P = response[: len(C), : B.shape[1]]
             K = response[len(C) :, B.shape[1] :] + D_c
-            sizes = np.linalg.svd(np.eye(len(K)) - K @ P, compute_uv=False)
+            loop = K @ P * (self.units / self.units[:, None])
+            sizes = np.linalg.svd(np.eye(len(K)) - loop, compute_uv=False)
             least = min(least, float(sizes[-1]))
         return least
 

@@ -16,6 +16,7 @@ from torch_qpmpc.checks import check_whole
 from torch_qpmpc.control.design import Design, read_bounds, read_moves, read_prices, read_weight
 from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import LinearScheme, free_mpc, lowered, target_mpc
+from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
@@ -130,13 +131,16 @@ class LinearMPC(QPMPC):
         check_whole("horizon", horizon, 1)
         weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
+        wishes = read_wishes(plant, **weights, **bounds)
+        limits = wishes["y_bounds"], wishes["u_bounds"], wishes["Q"]
+        scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
             plant=plant,
             horizon=int(horizon),  # pyright: ignore[reportArgumentType] - a number
-            **read_wishes(plant, **weights, **bounds),
+            **wishes,
             linear=read_prices(linear, plant),
             references=references,
-            disturbances=choose(plant, disturbances),
+            disturbances=choose(plant, disturbances, scaling),
             gamma=gamma,
             blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
         )
@@ -223,12 +227,11 @@ class LinearMPC(QPMPC):
         mpc.load_state_dict(content["mpc"])
         return mpc
 
-    @torch.no_grad()
     def target(self, r: Any, w: Any = 0.0, known: Any = 0.0) -> Target:
         """Return the steady states within the bounds that are nearest to set-points.
 
         The inputs exceed their bounds as little as possible if no steady state of a plant that
-        integrates is within them.
+        integrates is within them. All arguments are differentiable.
 
         Args:
             r: ``(*batch, n_y)``.
@@ -248,7 +251,7 @@ class LinearMPC(QPMPC):
     def steady_state(self, v: Tensor, s: Tensor) -> Target:
         """Return the steady state of ``v`` and ``s = [r; w; d]``, by the maps of ``steady``."""
         steady = self.design.steady
-        loads = torch.cat((s[..., len(steady.Q) :], s.new_ones(*s.shape[:-1], 1)), -1)
+        loads = torch.cat((s[..., len(steady.y) :], s.new_ones(*s.shape[:-1], 1)), -1)
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
         return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in pairs))
 

@@ -26,7 +26,7 @@ import torch
 from scipy.linalg import block_diag
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, half_range
+from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import RANK, null_direction, unseen_modes
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
@@ -116,9 +116,10 @@ def _cost(design: Design, layout: Layout) -> Cost:
 
 def riccati(design: Design) -> Array | None:
     """Return the cost to go of [x; u_last] about a steady state, None if it does not exist."""
+    design, (_, of_u, of_x, _) = design.normal, design.scaling
+    plant, m = design.plant, design.plant.sizes[1]
     if _costless(design):
         return None
-    plant, m = design.plant, design.plant.sizes[1]
     A, B = plant.A, plant.B
     Q, R = 2 * plant.C.T @ design.Q @ plant.C, 2 * (design.R + design.dR)
     S = np.zeros_like(B)
@@ -134,11 +135,12 @@ def riccati(design: Design) -> Array | None:
     radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
     eigenvalues = torch.linalg.eigvalsh(P)
     exists = radius < 1 - 1e-9 and eigenvalues[0] >= -1e-9 * eigenvalues[-1].abs()
-    return P.numpy() if exists else None
+    sizes = np.concatenate((of_x, of_u))[: len(P)]
+    return P.numpy() / np.outer(sizes, sizes) if exists else None
 
 
 def _costless(design: Design) -> bool:
-    """Return True if a mode on the unit circle is not observable in the cost.
+    """Return True if a mode on the unit circle is not observable in a normal design's cost.
 
     Then rounding alone decides what a solver of the Riccati equation returns.
     """
@@ -178,7 +180,7 @@ def _bounds(design: Design) -> Bounds:
 def is_split(design: Design) -> bool:
     """Return True if f has a QP of its own."""
     steady = design.steady
-    moved = np.abs(steady.Y[:, steady.n_a :]).max(-1, initial=0.0) > RANK
+    moved = steady.Y[:, steady.n_a :].any(-1)
     return 0 < steady.n_a < steady.Y.shape[1] and not (moved & design.bounded[0]).any()
 
 
@@ -196,21 +198,24 @@ def target_mpc(design: Design) -> QPMPC:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
     lower, upper = (side - steady.u[:, -1] for side in design.u_bounds)
     rows = (np.isfinite(lower) | np.isfinite(upper)) & inputs[:, n_x:].any(-1)
-    rows = inputs[rows], lower[rows], upper[rows]
+    y, u, _, d = design.scaling
+    D, of_s = inputs[rows] / u[rows, None], np.concatenate((y, design.of_w(y), d))
+    D[:, :n_x] *= of_s
+    rows = D, lower[rows] / u[rows], upper[rows] / u[rows]
     if split:
         rows = _without_last(*rows, len(steady.W))
     D, lower, upper = rows
+    D[:, :n_x] /= of_s
     lower_y, upper_y = (side - steady.y[:, -1] for side in design.y_bounds)
     error[:, :n_y] = 0.0
     soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
+    price = np.full(len(D), np.inf)
+    if np.linalg.matrix_rank(steady.U / u[:, None], RANK) < len(u):
+        # The plant integrates, and a load may have no steady inputs within bounds.
+        price[:] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
+    slack = np.append(price, np.minimum(design.y_slack, HARD)[soft])
     D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
     lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
-    price = np.inf
-    if np.linalg.matrix_rank(steady.U, RANK) < len(steady.U):
-        # The plant integrates, and a load may have no steady inputs within bounds.
-        slope = np.linalg.norm(weight[n_x:, n_x:], 2) * half_range(design.u_bounds).max()
-        price = NEARLY_HARD * slope
-    slack = np.append(np.full(len(rows[0]), price), np.minimum(design.y_slack, HARD)[soft])
     weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]
     return _of_one_stage(n_x, weight, linear, SCALE * design.typical, (D, lower, upper), slack)
 
@@ -222,13 +227,15 @@ def free_mpc(design: Design) -> QPMPC | None:
     steady, n_a, n_f = design.steady, design.steady.n_a, len(design.steady.W)
     n_x = n_a + steady.u.shape[1] - 1
     bounded = design.bounded[1]
-    D = np.hstack((steady.U[:, :n_a], steady.u[:, :-1], steady.U[:, n_a:]))[bounded]
-    rows = (D, *((side - steady.u[:, -1])[bounded] for side in design.u_bounds))
-    size = np.linalg.norm(steady.R, 2) * half_range(design.u_bounds).max()
+    D = np.hstack((steady.U[:, :n_a], steady.u[:, :-1], steady.U[:, n_a:]))
+    D, *sides = (
+        ((part.T / design.scaling.u).T)[bounded]
+        for part in (D, *(side - steady.u[:, -1] for side in design.u_bounds))
+    )
+    size = float(np.linalg.norm(steady.W, 2))
     slack = np.full(len(D), NEARLY_HARD * size)
     weight = block_diag(np.zeros((n_x, n_x)), 2 * steady.W)
-    constant = SCALE * size * half_range(design.u_bounds).max()
-    return _of_one_stage(n_x, weight, np.zeros(n_x + n_f), constant, rows, slack)
+    return _of_one_stage(n_x, weight, np.zeros(n_x + n_f), SCALE * size, (D, *sides), slack)
 
 
 def _of_one_stage(

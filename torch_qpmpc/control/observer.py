@@ -8,8 +8,9 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import block_diag
 
-from torch_qpmpc.control.design import Design, half_range, largest
+from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.disturbance import RANK, check_observable
+from torch_qpmpc.control.scaling import ranges
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 
@@ -17,6 +18,8 @@ from torch_qpmpc.errors import QPError
 SMALL = 0.1
 #: A filter's mode this near to the unit circle counts as on it.
 ON_CIRCLE = 1e-9
+#: A smaller singular value, relative to the largest, determines no estimate at rest.
+REST = 1e-12
 #: Signals above this multiple of a usual size are errors: estimates would lose their digits.
 ABSURD = 1e8
 
@@ -63,13 +66,15 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     Raises:
         QPError: the model has a mode that the outputs do not show, or that no input moves.
     """
-    plant, w = design.plant, design.disturbances
+    model, (of_y, _, of_x, _) = design.plant, design.scaling
+    of_w = design.of_w(of_y)
+    plant, w, n_w = design.normal.plant, design.normal.disturbances, len(of_w)
+    noise, drift, of_e = noise / of_y, drift / of_w, np.concatenate((of_x, of_w))
     n, _, n_y, _ = plant.sizes
-    n_w = len(w.names)
     check_observable(plant)
     F = np.block([[plant.A, w.B], [np.zeros((n_w, n)), np.eye(n_w)]])
     H = np.hstack((plant.C, w.C))
-    inputs = plant.B * (SMALL**2 * half_range(design.u_bounds))
+    inputs = SMALL**2 * plant.B
     process = block_diag(inputs @ inputs.T, np.diag(drift**2))
     try:
         P = scipy.linalg.solve_discrete_are(F.T, H.T, process, np.diag(noise**2))
@@ -81,30 +86,30 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         got = "a model whose Kalman filter does not converge"
         remedy = "It has a mode on the unit circle that no input moves: remove it."
         raise QPError.expected("model", got, "a model with a steady-state filter", remedy)
-    below = ((0, n_w), (0, 0))
+    rest = np.linalg.pinv(np.vstack((F - np.eye(n + n_w), H)), rcond=REST)
+    below, own = ((0, n_w), (0, 0)), design.disturbances
     return Observer(
-        F,
-        np.pad(plant.B, below),
-        np.pad(plant.E, below),
-        np.pad(plant.offset, (0, n_w)),
-        H,
-        L,
-        np.linalg.pinv(np.vstack((F - np.eye(n + n_w), H)), rcond=1e-12),
+        np.block([[model.A, own.B], [F[n:]]]),
+        np.pad(model.B, below),
+        np.pad(model.E, below),
+        np.pad(model.offset, (0, n_w)),
+        np.hstack((model.C, own.C)),
+        of_e[:, None] * L / of_y,
+        of_e[:, None] * rest / np.concatenate((of_e, of_y)),
     )
 
 
 def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
     """Return the largest plausible sizes of outputs, ``(n_y,)``, and known signals, ``(n_d,)``.
 
-    They are `ABSURD` times a usual size. An output's is the largest of its bounds, their half range
-    or one, ``noise`` over `SMALL`, and its response to a step of the inputs within the horizon. A
-    known signal's is one, or the size that moves the state as the inputs do if that is more. Known
-    signals that move no state are not limited.
+    They are `ABSURD` times a usual size. An output's is the largest of its bounds, its usual
+    deviation, ``noise`` over `SMALL`, and its response to a step of the inputs within the horizon.
+    A known signal's is one, or the size that moves the state as the inputs do if that is more.
+    Known signals that move no state are not limited.
     """
-    sizes_y, sizes_u = (
-        np.maximum(largest(bounds), half_range(bounds))
-        for bounds in (design.y_bounds, design.u_bounds)
-    )
+    sizes_y = np.maximum(largest(design.y_bounds), design.usual)
+    sizes_u = np.maximum(largest(design.u_bounds), ranges(design.u_bounds))
+    sizes_u = np.where(sizes_u > 0, sizes_u, 1.0)
     plant, x = design.plant, design.plant.B * sizes_u
     usual, moved = np.maximum(sizes_y, noise / SMALL), np.linalg.norm(x)
     for _ in range(design.horizon):

@@ -15,8 +15,8 @@ import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
 from torch_qpmpc.checks import check_kind
-from torch_qpmpc.control.design import Design, half_range, middle
-from torch_qpmpc.control.disturbance import unseen_modes
+from torch_qpmpc.control.design import Design, middle
+from torch_qpmpc.control.disturbance import TINY, unseen_modes
 from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.proofs import Answer
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
-MARGIN, CONDITION, SPREAD, HIDDEN = 0.3, 1e8, 1e4, 1e-3
+MARGIN, CONDITION, HIDDEN = 0.3, 1e8, 1e-3
 #: An output's weight with a smaller share of the cost does not matter; one that does.
 IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
@@ -159,7 +159,6 @@ def review(
         _gains(design),
         _horizon(design),
         _disturbances(design),
-        _scaling(design),
         _hard_rows(mpc, r_last, known),
         _set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
@@ -170,7 +169,7 @@ def review(
     plan, target = make_tables(mpc), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(mpc, law.observer, plan, target)
-    findings.append(_condition(plan.condition, cost.numbers["largest"]))
+    findings.append(_condition(design, *cost.numbers.values()))
     findings.append(_stability(loop, design.gamma))
     if loop.radius < 1:
         findings += [_margin(loop, law, plan, target), _offset(loop, design)]
@@ -193,27 +192,36 @@ def review(
 
 
 def _cost(mpc: LinearMPC) -> Finding:
-    """H is positive definite on the plans that satisfy C z = b."""
-    qp = mpc.quadratic_program()
-    H, C = (x.detach().double().numpy() for x in (qp.H, qp.C))
+    """H is positive definite on the plans that satisfy C z = b, in signals divided by sizes."""
+    qp, design = mpc.quadratic_program(), mpc.design
+    y, u, x, _ = design.scaling
+    state = (x, u[: len(u) * design.moves], y[design.bounded[0]], u[design.bounded[1]], [1.0])
+    later = np.tile(np.concatenate((u, *state)), mpc.horizon)
+    units = np.concatenate((np.ones(mpc.n_p), later))
+    H, C = (x.detach().double().numpy() * units for x in (qp.H, qp.C))
+    C = C / np.maximum(np.abs(C).max(1, keepdims=True, initial=0.0), TINY)
     T_v = null_space(C[None], mpc.n_p).T[0][:, mpc.n_p :]
+    H = units[:, None] * H
     sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
     numbers = {"smallest eigenvalue on the plan": sizes[0], "largest": sizes[-1]}
     ok = bool(sizes[0] > SINGULAR * sizes[-1])
-    remedy = _weighted(sizes[-1])
+    remedy = _weighted(design, sizes[-1])
     if sizes[0] < -SINGULAR * abs(sizes[-1]):
         remedy = "Learning has made it indefinite: mpc.reset_parameters(), or learn other parts."
     return Finding("cost", ok, numbers, remedy * (not ok))
 
 
-def _weighted(largest: float) -> str:
-    return f"Raise the weights of the inputs to R={1e-3 * largest:.1g}."
+def _weighted(design: Design, largest: float) -> str:
+    least = [f"{1e-3 * largest / u**2:.1g}" for u in design.scaling.u]
+    named = ", ".join(f"{u!r}: {x}" for u, x in zip(design.plant.inputs, least, strict=True))
+    alike = len({*least}) == 1
+    return f"Raise the weights of the inputs to R={least[0] if alike else f'{{{named}}}'}."
 
 
 def _terminal(design: Design) -> Finding:
     """The terminal weight is the cost to go of the loop without bounds."""
-    plant, exists = design.plant, riccati(design) is not None
-    unseen = unseen_modes(plant.A, design.Q @ plant.C)
+    plant, exists = design.normal.plant, riccati(design) is not None
+    unseen = unseen_modes(plant.A, design.normal.Q @ plant.C)
     unmoved = unseen_modes(plant.A.T, plant.B.T)
     numbers: dict[str, Any] = {"Riccati solution": "exists" if exists else "none"}
     remedy = "Weight all inputs, by R or dR."
@@ -249,7 +257,7 @@ def _horizon(design: Design) -> Finding:
     """The plan is longer than dead times and inverse responses."""
     plant, N, numbers, needed = design.plant, design.horizon, {}, 1
     stable = np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9
-    x, steps = plant.B * half_range(design.u_bounds), []
+    x, steps = plant.B * design.scaling.u, []
     for _ in range(max(10 * N, 200)):
         steps.append(plant.C @ x)
         x = plant.A @ x
@@ -271,7 +279,7 @@ def _horizon(design: Design) -> Finding:
 
 def _disturbances(design: Design) -> Finding:
     """The outputs tell the disturbances from the state."""
-    plant, w = design.plant, design.disturbances
+    plant, w = design.normal.plant, design.normal.disturbances
     matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
     matrix = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
     _, sizes, V = np.linalg.svd(matrix)
@@ -283,34 +291,17 @@ def _disturbances(design: Design) -> Finding:
     return Finding("disturbances", ok, numbers, remedy * (not ok))
 
 
-def _scaling(design: Design) -> Finding:
-    """The distances of the bounds have similar sizes."""
-    sizes = {}
-    for names, bounds in (
-        (design.plant.outputs, design.y_bounds),
-        (design.plant.inputs, design.u_bounds),
-    ):
-        finite = np.isfinite(bounds[0]) & np.isfinite(bounds[1])
-        half = half_range(bounds)
-        sizes |= {name: half[i] for i, name in enumerate(names) if finite[i]}
-    spread = max(sizes.values(), default=1.0) / min(sizes.values(), default=1.0)
-    ok = bool(spread <= SPREAD)
-    units = {name: 10 ** np.round(np.log10(x)) for name, x in sizes.items()}
-    named = ", ".join(f"{name} in units of {x:g}" for name, x in units.items() if x != 1)
-    numbers = {f"half range of {name}": x for name, x in sizes.items()}
-    return Finding("scaling", ok, numbers, f"Measure {named}." * (not ok))
-
-
 @torch.no_grad()
 def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     """Outputs off the set-point, and last inputs at their bounds, leave a plan."""
     design, n_y = mpc.design, len(mpc.design.Q)
-    half = np.diag(half_range(design.y_bounds))
+    half = np.diag(design.scaling.y)
     off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
     off = off.reshape(-1, n_y)
     rest = mpc.target(r[0] if len(r) else middle(design.y_bounds), known=known)
-    x = np.vstack((off @ np.linalg.pinv(design.plant.C).T, np.zeros((2, len(rest.x)))))
-    x = rest.x.numpy() + x
+    of_y, _, of_x, _ = design.scaling
+    x = (off / of_y) @ np.linalg.pinv(design.normal.plant.C).T * of_x
+    x = rest.x.numpy() + np.vstack((x, np.zeros((2, len(of_x)))))
     ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
     u_last = np.vstack((np.tile(rest.u, (len(off), 1)), ends))
     stages = (len(x), mpc.horizon + 1) if design.references == "preview" else (len(x),)
@@ -345,7 +336,7 @@ class Setting(NamedTuple):
     def off(self, y: Array, r: Array) -> Array:
         """Return the mask of outputs with a weight that are off their set-points."""
         design = self.mpc.design
-        return (np.diag(design.Q) > 0) & (np.abs(y - r) > OFFSET * half_range(design.y_bounds))
+        return (np.diag(design.Q) > 0) & (np.abs(y - r) > OFFSET * design.scaling.y)
 
 
 def _set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
@@ -403,11 +394,11 @@ def _settable(setting: Setting, r: Array) -> dict[int, str]:
 def _limits(design: Design, target: Target) -> str:
     """Return what a user can do about the bounds that a target is at."""
     named = []
-    for kind, names, bounds, x in (
-        ("y_bounds", design.plant.outputs, design.y_bounds, target.y.numpy()),
-        ("u_bounds", design.plant.inputs, design.u_bounds, target.u.numpy()),
+    for kind, names, bounds, x, size in (
+        ("y_bounds", design.plant.outputs, design.y_bounds, target.y.numpy(), design.scaling.y),
+        ("u_bounds", design.plant.inputs, design.u_bounds, target.u.numpy(), design.scaling.u),
     ):
-        near = OFFSET * half_range(bounds)
+        near = OFFSET * size
         at = np.flatnonzero((x <= bounds[0] + near) | (x >= bounds[1] - near))
         if len(at):
             named.append(f"{kind} of {' and '.join(names[i] for i in at)}")
@@ -441,11 +432,12 @@ def _reach(setting: Setting) -> tuple[Array, Array]:
     return ends[0], ends[1]
 
 
-def _condition(condition: float, largest: float) -> Finding:
+def _condition(design: Design, smallest: float, largest: float) -> Finding:
     """The QP's numbers are exact enough."""
-    ok = bool(condition < CONDITION)
-    remedy = _weighted(largest)
-    return Finding("condition", ok, {"of the cost on the plan": condition}, remedy * (not ok))
+    ok, remedy = bool(largest < CONDITION * smallest), _weighted(design, largest)
+    return Finding(
+        "condition", ok, {"of the cost on the plan": largest / smallest}, remedy * (not ok)
+    )
 
 
 def _stability(loop: LinearLoop, gamma: float) -> Finding:
@@ -494,8 +486,8 @@ def _offset(loop: LinearLoop, design: Design) -> Finding:
     removable = Y @ np.linalg.pinv(Y.T @ design.Q @ Y, rcond=1e-10) @ Y.T @ design.Q
     m = len(design.plant.inputs)
     n_y = len(Y)
-    units = np.concatenate((half_range(design.u_bounds), *[half_range(design.y_bounds)] * 2))
-    off = np.abs(removable @ loop.offsets() * units) / half_range(design.y_bounds)[:, None]
+    units = np.concatenate((design.scaling.u, *[design.scaling.y] * 2))
+    off = np.abs(removable @ loop.offsets() * units) / design.scaling.y[:, None]
     parts = {"load": off[:, :m], "bias": off[:, m : m + n_y], "set-point": off[:, m + n_y :]}
     numbers = {f"offset of a full {key}": x.max(initial=0.0) for key, x in parts.items()}
     ok = bool(off.max(initial=0.0) < OFFSET)

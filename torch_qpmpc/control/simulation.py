@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_seed, check_whole
-from torch_qpmpc.control.design import Design, half_range, middle
+from torch_qpmpc.control.design import Design, middle
 from torch_qpmpc.control.law import Law, Memory, Move, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.state_space import (
@@ -236,7 +236,7 @@ def centre(design: Design, known: Array) -> Array:
 
     An input with one bound is half its range from it.
     """
-    half, (lower, upper) = half_range(design.u_bounds), design.u_bounds
+    half, (lower, upper) = design.scaling.u, design.u_bounds
     u, y = np.clip(0.0, lower + half, upper - half), middle(design.y_bounds)
     held = design.plant.C @ design.plant.at_rest(u, known, y, FAINT)
     return np.where(np.isfinite(design.y_bounds).all(0), y, np.clip(held, *design.y_bounds))
@@ -313,7 +313,7 @@ class Probe(NamedTuple):
 def probe(law: Law, known: Array) -> Probe:
     """Run a loop with moving set-points and a load, from rest near `centre`."""
     design, rng = law.design, np.random.default_rng(0)
-    plant, size_y, size_u = design.plant, half_range(design.y_bounds), half_range(design.u_bounds)
+    plant, size_y, size_u = design.plant, design.scaling.y, design.scaling.u
     (x, u), rows = at_rest(law.mpc, known), design.horizon + 1
     moves = rng.uniform(-1, 1, (-(-PROBED // HELD), len(size_y))).repeat(HELD, 0)
     r = centre(design, known) + MOVE * size_y * np.vstack((moves[:PROBED], moves[-1:]))

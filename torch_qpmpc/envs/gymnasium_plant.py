@@ -30,7 +30,7 @@ from torch_qpmpc.errors import QPError
 
 #: The length of episodes of an environment that has no limit of its own.
 STEPS = 200
-#: The size of an action that is a solver's rounding.
+#: The size of an action that is a solver's rounding, relative to its bounds.
 ROUNDING = 1e-9
 
 
@@ -88,10 +88,12 @@ class GymnasiumPlant:
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
         """Make one environment; ``max_steps`` replaces the length of its episodes.
 
-        Actions within 1e-9 of zero are zero, because some plants react to any other.
+        Actions within 1e-9 of their bounds' size of zero are zero, because some plants react to
+        any other.
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
-        env = TransformAction(_Guarded(env, self.raised), _without_rounding, None)
+        rounded = partial(_without_rounding, env.action_space)
+        env = TransformAction(_Guarded(env, self.raised), rounded, None)
         if isinstance(env.observation_space, Dict | Tuple):
             env = FlattenObservation(env)
         return env if self.past == 1 else WindowObservation(env, self.past)
@@ -197,6 +199,8 @@ class _Guarded(gymnasium.Wrapper):
         return step
 
 
-def _without_rounding(action: np.ndarray) -> np.ndarray:
+def _without_rounding(space: Any, action: np.ndarray) -> np.ndarray:
     """Return zero for entries of the action that are a solver's rounding."""
-    return np.where(np.abs(action) <= ROUNDING, 0, action).astype(action.dtype)
+    ends = np.abs((getattr(space, "low", 0.0), getattr(space, "high", 0.0)))
+    size = np.where(np.isfinite(ends), ends, 0.0).max(0)
+    return np.where(np.abs(action) <= ROUNDING * size, 0, action).astype(action.dtype)

@@ -156,7 +156,7 @@ def _worse_than_zero(summary: Mapping[str, Any]) -> list[str]:
     worse = {
         name: cost_text(J)
         for name, J in ends.items()
-        if not (zero >= J or math.isclose(J, zero, rel_tol=1e-6, abs_tol=1e-9))
+        if not (zero >= J or math.isclose(J, zero, rel_tol=1e-6))
     }
     if not worse:
         return []

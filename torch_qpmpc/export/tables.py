@@ -20,11 +20,14 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
+from torch_qpmpc.qp.pipeline.scaling import lengths
 from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, Status, crossed
 from torch_qpmpc.qp.solve import solve_qp
 
 #: H_v is singular if its smallest eigenvalue is below this fraction of the largest.
 SINGULAR = 1e-12
+#: A length that is no divisor.
+TINY = 1e-300
 #: Weight of entries without bounds at the centre, relative to those with.
 CENTRED = 1e-6
 
@@ -111,6 +114,19 @@ def make_tables(mpc: QPMPC) -> Tables:
     _check(qp)
     n_p, n_u = mpc.n_p, mpc.n_u
     H = (H + H.T) / 2
+    # In units of the free entries of z that equilibrate H, C and G; p, u_0 and y keep their own.
+    units = lengths(H[None], np.concatenate((C, G))[None])[0]
+    units[:n_p] = 1.0
+    of_C = np.maximum(np.abs(C * units).max(-1, initial=0.0), TINY)
+    original, H, q, C, b, G = (
+        G,
+        H * np.outer(units, units),
+        q * units,
+        C * units,
+        b / of_C,
+        G * units,
+    )
+    C = C / of_C[:, None]
 
     # z = T_p p + T_v v + z_b, with an orthonormal basis of v.
     elimination = null_space(C[None], n_p)
@@ -136,7 +152,8 @@ def make_tables(mpc: QPMPC) -> Tables:
     known = _known(G[others] @ T_p, G[others] @ z_b, *(x[others] for x in bounds))
     known = _with(known, _implied(C, T_p, z_b, b))
     u = slice(n_p, n_p + n_u)
-    u_lower, u_upper = _action_bounds(G, lb, ub, w, u)
+    u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
+    of_u = units[u]
     return Tables(
         n_p,
         n_u,
@@ -144,9 +161,9 @@ def make_tables(mpc: QPMPC) -> Tables:
         known,
         R @ R.T,
         R,
-        Z[u],
-        z_0[u],
-        np.linalg.solve(factor, T_v[u].T).T @ R.T,
+        of_u[:, None] * Z[u],
+        of_u * z_0[u],
+        of_u[:, None] * np.linalg.solve(factor, T_v[u].T).T @ R.T,
         Z.T @ H @ Z,
         Z.T @ (H @ z_0 + q),
         float(c + (q + H @ z_0 / 2) @ z_0),

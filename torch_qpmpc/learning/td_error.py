@@ -19,7 +19,7 @@ OFFSET = 0.05
 FLOOR = 0.01
 #: Smallest batch to which the variance is fitted.
 LEAST = 16
-#: Keeps equal inputs from a division by zero, and collinear ones apart.
+#: Deviations below this fraction of an input are rounding; keeps collinear inputs apart, too.
 TINY = 1e-9
 
 
@@ -109,7 +109,7 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
     if len(square) < LEAST or not square.any():
         return weight
     inputs = _square(p[use]), _square(a[use]), value[use].abs()
-    logs = [torch.log(OFFSET + x.to(square) / x.mean().clamp(min=TINY)) for x in inputs]
+    logs = [torch.log(OFFSET + x.to(square) / _positive(x.mean())) for x in inputs]
     features = F.pad(torch.stack(logs, -1), (1, 0), value=1.0)
     offset = FLOOR * square.median() + TINY * square.mean()
     gram = features.mT @ features + TINY * len(square) * torch.eye(4).to(square)
@@ -123,4 +123,10 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
 def _square(x: Tensor) -> Tensor:
     """Return the mean square of each row's standardised entries, ``(B,)``."""
     deviation = x - x.mean(0)
-    return (deviation.square() / deviation.square().mean(0).clamp(min=TINY)).mean(-1)
+    least = _positive((TINY * x).square().amax(0))
+    return (deviation.square() / deviation.square().mean(0).maximum(least)).mean(-1)
+
+
+def _positive(x: Tensor) -> Tensor:
+    """Return x, and one in place of zero."""
+    return torch.where(x > 0, x, 1.0)

@@ -31,9 +31,6 @@ from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.tightening import back_off, tighten
 
-#: The least size of the costs of a start that holds an action.
-TINY = 1e-6
-
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
@@ -178,7 +175,7 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     reward = log.get(("next", "reward"), torch.zeros(()))  # a task with a weight needs none
     costs = -reward.double().reshape(log.shape)[valid] if reward.ndim else reward.double()
     size = (log["action"][valid].double() - held).abs().amax(0)
-    R = costs.abs().mean().clamp(min=TINY) / size.square()
+    R = (costs.abs().mean() if costs.any() else 1.0) / size.square()
     gamma, N, zero = scheme.gamma, layout.horizon, R.new_zeros(layout.n_x)
     q = torch.cat((R.new_zeros(layout.n_before), layout.stages(zero, -R * held)))
     ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()

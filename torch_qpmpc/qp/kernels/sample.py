@@ -56,8 +56,9 @@ from torch_qpmpc.qp.kernels.linalg import (
     transposed_products,
 )
 
-#: A row without free variables that is violated by more has its weight as multiplier.
-VIOLATED = 1e-9
+#: A row without free variables that is violated by more, or whose violation costs more than the
+#: second, has its weight as multiplier.
+VIOLATED, COSTLY = 1e-9, 1e-7
 #: Largest number of active sets that a warm start tries for one QP.
 MAX_STEPS = 10
 #: Largest number of solves of one system: the first, and refinements.
@@ -170,11 +171,13 @@ def _all_multipliers(lam_v, y, theta, rows, others):
             force, weight = lam[i, j], w[i_w, j]
             lam[i, j] = weight if force > weight else -weight if force < -weight else force
         for j in others:
-            if w[i_w, j] < np.inf:  # a violated hard row stays violated: the residual shows it
-                if y[i, j] - ub[i_ub, j] > VIOLATED:
-                    lam[i, j] = w[i_w, j]
-                elif lb[i_lb, j] - y[i, j] > VIOLATED:
-                    lam[i, j] = -w[i_w, j]
+            weight = w[i_w, j]
+            if weight < np.inf:  # a violated hard row stays violated: the residual shows it
+                least = VIOLATED if VIOLATED * weight < COSTLY else COSTLY / weight
+                if y[i, j] - ub[i_ub, j] > least:
+                    lam[i, j] = weight
+                elif lb[i_lb, j] - y[i, j] > least:
+                    lam[i, j] = -weight
         for j in range(lam.shape[1]):
             below, above, weight = lb[i_lb, j], ub[i_ub, j], w[i_w, j]
             at = y[i, j] + lam[i, j]

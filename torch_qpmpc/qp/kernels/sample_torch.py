@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels.sample import (
     CANCELLED,
+    COSTLY,
     DEPENDENT,
     DOUBTFUL,
     FLOOR,
@@ -56,7 +57,8 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes) -> tu
         z = z + multiply(Y_neg, group, multiply(C, group, z) - theta.b)
     Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
     # A violated row without free variables has lam = w or -w; a hard one stays violated.
-    beyond = F.hardshrink(y - y.clamp(theta.lb, theta.ub), VIOLATED)
+    beyond = y - y.clamp(theta.lb, theta.ub)
+    beyond = beyond * (beyond.abs() > (COSTLY / theta.w).clamp(max=VIOLATED))
     all_lam = beyond.sign() * theta.w.masked_fill(theta.w.isinf(), 0.0)
     all_lam[:, reduced.rows] = lam.clamp(-reduced.w, reduced.w)
     G_lam = multiply(theta.G.mT, group, all_lam)

@@ -110,14 +110,27 @@ class Prepared:
         """Units in which the QPs are solved; None if all are one."""
         return Units.of(self.theta, self.group)
 
+    @cached_property
+    def lengths(self) -> Units | None:
+        """Units of the entries of z alone, None if all are one; they do not depend on bounds."""
+        return Units.of_columns(self.theta) if self.units and not self.units.one_length else None
+
     @property
     def scaled(self) -> Prepared:
         """The same theta, in its `units`."""
         if self._scaled is None:
             assert self.units is not None
-            theta = self.units.scaled(self.theta, self.group)
-            self._scaled = Prepared(theta, self.group, self.n_kept, self.device)
+            self._scaled = self._in(self.units)
         return self._scaled
+
+    @cached_property
+    def equilibrated(self) -> Prepared:
+        """The same theta, in its `lengths`."""
+        return self if self.lengths is None else self._in(self.lengths)
+
+    def _in(self, units: Units) -> Prepared:
+        theta = units.scaled(self.theta, self.group)
+        return Prepared(theta, self.group, self.n_kept, self.device)
 
     def condensed(self, n_f: int) -> Condensed:
         """Return the QPs without C z = b, for n_f fixed entries."""
@@ -317,10 +330,17 @@ class Programs:
 
     def scaled(self) -> Programs:
         """Return the same QPs in their own units."""
-        prepared = self.prepared
-        assert prepared.units is not None
-        length = per_qp(prepared.units.length, self.group)[:, : self.n_f]
-        return Programs(prepared.scaled, self.group, self.fixed / length)
+        assert self.prepared.units is not None
+        return self._in(self.prepared.scaled, self.prepared.units)
+
+    def equilibrated(self) -> Programs:
+        """Return the same QPs in lengths of z that do not depend on bounds."""
+        units = self.prepared.lengths
+        return self if units is None else self._in(self.prepared.equilibrated, units)
+
+    def _in(self, prepared: Prepared, units: Units) -> Programs:
+        length = per_qp(units.length, self.group)[:, : self.n_f]
+        return Programs(prepared, self.group, self.fixed / length)
 
     def eliminated(self, elimination: Elimination) -> Programs:
         """Return the same QPs with another elimination of C z = b."""

@@ -9,7 +9,7 @@ and of the rows rho (of G) and gamma (of C),
 
 is the same QP. All units are powers of two, so that rounding does not change. The entries of z
 share one length, unless the columns of H, C and G differ by orders of magnitude, as for states in
-watts beside actions between -1 and 1: then each has its own, from equilibration (Ruiz, 2001).
+watts beside actions between -1 and 1: then each has its own, from equilibration.
 """
 
 from __future__ import annotations
@@ -49,14 +49,20 @@ class Units(NamedTuple):
         """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
-        columns = _columns(theta)
-        if columns is not None:
-            n_c, n_g = theta.C.shape[1], theta.G.shape[1]
-            one = np.ones((len(columns), 1))
-            own = cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1))
+        if (own := cls.of_columns(theta)) is not None:
             units = cls.of_rows_and_cost(own.scaled(theta, group), group)
-            return own if units is None else units._replace(length=units.length * columns)
+            return own if units is None else units._replace(length=units.length * own.length)
         return cls.of_rows_and_cost(theta, group)
+
+    @classmethod
+    @np.errstate(all="ignore")
+    def of_columns(cls, theta: Theta) -> Units | None:
+        """Return units of the entries of z that follow from the matrices; None if alike."""
+        if (columns := _columns(theta)) is None:
+            return None
+        one = np.ones((len(columns), 1))
+        n_c, n_g = theta.C.shape[1], theta.G.shape[1]
+        return cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1))
 
     @classmethod
     @np.errstate(all="ignore")
@@ -120,41 +126,46 @@ class Units(NamedTuple):
 
 
 def _columns(theta: Theta) -> np.ndarray | None:
-    """Return units of the entries of z ``(M, n_z)`` that equilibrate H, C and G; None if alike."""
+    """Return the `lengths` of the entries of z; None if the columns are alike."""
     of_C, of_G = (column_sizes(x) for x in (theta.C, theta.G))
     curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
     if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
         return None
-    rows = np.concatenate((theta.C, theta.G), axis=1)
-    M, n = curvature.shape
+    return lengths(theta.H, np.concatenate((theta.C, theta.G), axis=1))
+
+
+def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return units of the entries of z ``(M, n_z)`` that equilibrate H and rows of equations.
+
+    Their logarithms, and those of units of the rows and of the cost, bring those of the entries
+    nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
+    part in its unit.
+    """
+    (M, n, _), r = H.shape, rows.shape[1]
     # The matrices of an MPC scheme are sparse.
-    (m, i, j), (k, row, column) = theta.H.nonzero(), rows.nonzero()
-    H, entries = np.abs(theta.H[m, i, j]), np.abs(rows[k, row, column])
-    units, of_row, kappa = np.ones((M, n)), np.ones(rows.shape[:2]), np.ones(M)
+    (m, i, j), (k, row, column) = H.nonzero(), rows.nonzero()
+    of_cost, of_row = np.log2(np.abs(H[m, i, j])), np.log2(np.abs(rows[k, row, column]))
+    of_column = np.concatenate((m * n + j, k * n + column))
+    units, by_row, cost = np.zeros((M, n)), np.zeros((M, r)), np.zeros(M)
     for _ in range(PASSES):
-        of_H = H * units[m, j] * units[m, i] * kappa[m]
-        now = entries * units[k, column] * of_row[k, row]
-        largest = np.zeros(M * n)
-        np.maximum.at(largest, m * n + j, of_H)
-        np.maximum.at(largest, k * n + column, now)
-        units = units / np.sqrt(_positive_or_one(largest)).reshape(M, n)
-        largest = np.zeros(of_row.size)
-        np.maximum.at(largest, k * rows.shape[1] + row, now)
-        of_row = of_row / _positive_or_one(largest).reshape(of_row.shape)
-        largest = np.zeros(M)
-        np.maximum.at(largest, m, of_H)
-        kappa = kappa / _positive_or_one(largest)
-    return np.ldexp(1.0, np.frexp(units)[1])
+        by_row -= _means(k * r + row, of_row + units[k, column], M * r).reshape(M, r) + by_row
+        cost -= _means(m, of_cost + units[m, i] + units[m, j], M) + cost
+        of_H = of_cost + units[m, i] + units[m, j] + cost[m]
+        both = np.concatenate((of_H, of_row + units[k, column] + by_row[k, row]))
+        units -= _means(of_column, both, M * n).reshape(M, n)
+    return np.exp2(np.round(units))
+
+
+def _means(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return the mean of the values in each of ``count`` groups, zero in empty ones."""
+    sizes = np.bincount(groups, minlength=count)
+    return np.bincount(groups, values, minlength=count) / np.maximum(sizes, 1)
 
 
 def _apart(sizes: np.ndarray) -> bool:
     """Return True if positive sizes differ by more than `APART`."""
     smallest = np.where(sizes > 0, sizes, np.inf).min(-1, initial=np.inf)
     return bool((sizes.max(-1, initial=0.0) > APART * smallest).any())
-
-
-def _positive_or_one(sizes: np.ndarray) -> np.ndarray:
-    return np.where((sizes > 0) & (sizes < np.inf), sizes, 1.0)
 
 
 def _typical(sizes: np.ndarray) -> np.ndarray:

@@ -300,19 +300,28 @@ def _solved(programs: Programs, solver: str, start: Array | None, log: SolveLog)
 def _confirmed(programs: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
     """Certify scaled solutions in the original numbers, too; solve second those that fail.
 
+    Of numbers whose columns differ by orders of magnitude, those in lengths of z that follow from
+    the matrices are taken as the original ones: the error of a value has no bound without.
+
     The units depend on the bounds. A bound that is far from every solution, such as a large number
     in place of inf, makes them so large that a certificate in these units misses errors.
     """
     units, accepted = programs.prepared.units, np.flatnonzero(solution.accepted())
     assert units is not None
+    if (lengths := programs.prepared.lengths) is not None:
+        scaled, programs = programs.scaled(), programs.equilibrated()
+        solution = lengths.inverse().restored(solution, programs.group)
+        units = units._replace(length=units.length / lengths.length)
+    else:
+        scaled = programs.scaled()
     failed = refine(programs, solution, _refuted(programs, solution, accepted))
     if len(failed):
         solution.put(failed, _solved(programs.take(failed), solver, None, SolveLog()))
         in_units = units.inverse().restored(solution, programs.group)
         failed = failed[solution.accepted()[failed]]
-        failed = _refuted(programs.scaled(), in_units, failed)
+        failed = _refuted(scaled, in_units, failed)
         solution.put(failed, programs.unsolved(Status.NOT_CONVERGED).at(failed))
-    return solution
+    return solution if lengths is None else lengths.restored(solution, programs.group)
 
 
 def _refuted(programs: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:

@@ -1,0 +1,137 @@
+"""The same plant in other units is the same controller: `python -m tests.campaign.units`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import torch_qpmpc as qm
+from tests.campaign.units import judged
+from torch_qpmpc import QPError
+from torch_qpmpc.control.lowering import riccati
+
+#: Units of the first and the second signal.
+FAR = [(1.0, 1.0), (1e5, 1e-2), (1e-6, 1e4), (2e5, 5e-3)]
+
+
+def two_by_two(y, u, **options):
+    """Return the controller of two coupled signals in units y, with inputs in units u."""
+    y, u = np.array(y), np.array(u)
+    B = np.array([[0.3, 0.1], [0.05, 0.2]]) * y[:, None] / u
+    weights = {"Q": 1 / y**2, "dR": 0.1 / u**2, "y_slack": 1e3 / y}
+    bounds = {"u_bounds": (-3 * u, 3 * u), "y_bounds": (-5 * y, 5 * y)}
+    model = np.diag([0.7, 0.8]), B
+    return qm.Controller(qm.LinearMPC(model, 10, **{**weights, **bounds, **options}))
+
+
+@pytest.mark.parametrize("y", FAR)
+@pytest.mark.parametrize("u", [(1.0, 1.0), (1e5, 1e-5)])
+@pytest.mark.parametrize("bounded", [True, False])
+def test_a_set_point_in_any_unit_is_tracked_and_the_design_is_sound(y, u, bounded, tmp_path):
+    options = {} if bounded else {"y_bounds": None}
+    controller, r = two_by_two(y, u, **options), np.array([1.0, -0.5])
+    assert len(controller.mpc.design.steady.W) == 0
+    assert np.allclose(controller.mpc.target(r * y).y.numpy() / y, r, atol=1e-9)
+    assert controller.review(r * y).faults == []
+    assert controller.export_c(tmp_path).difference is not None
+    plant, x = controller.mpc.design.plant, np.zeros(2)
+    for _ in range(100):
+        x = plant.A @ x + plant.B @ controller.step(x, r * y)
+    assert np.allclose(x / y, r, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e5])
+def test_an_input_in_watts_has_its_part_in_the_target(unit):
+    A, B = np.array([[0.95, 0.0], [0.02, 0.9]]), np.array([[0.05, 0.0], [-0.01, 1e-6 * unit]])
+    weights = {"Q": 1.0, "dR": [0.1, 0.1 * (1e-5 * unit) ** 2]}
+    bounds = {"u_bounds": ([-3.0, -3e5 / unit], [3.0, 3e5 / unit])}
+    target = qm.LinearMPC((A, B), 20, **weights, **bounds).target([0.5, 0.7])
+    assert np.allclose(target.y, [0.5, 0.7])
+    assert np.allclose(target.u.numpy() * [1.0, unit], [0.5, 65000.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3, 1e5, 1e-7])
+def test_a_state_s_unit_chooses_no_disturbance(unit):
+    A, B = np.array([[0.9, 0.05], [0.1, 0.8]]), np.array([[0.1], [0.2]])
+    T = np.diag([unit, 1.0])
+    model = T @ A @ np.linalg.inv(T), T @ B, [[1 / unit, 0.0]]
+    mpc = qm.LinearMPC(model, 5, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+    assert mpc.design.disturbances.names == ("disturbance of y1",)
+
+
+@pytest.mark.parametrize("units", [(1e-6, 1.0, 1e3, 1e6), (1e5, 1e-3, 1.0, 10.0)])
+def test_outputs_in_far_units_have_the_same_disturbances_and_moves(units):
+    A = np.diag([0.95, 0.9, 0.97, 0.85]) + np.diag([0.1] * 3, 1)
+    A[3, 0] = 0.02
+    B = np.array([[0.0, 0.05], [0.1, 0.0], [0.0, 0.1], [0.1, 0.1]])
+    moves, names = [], []
+    for unit in np.ones(4), np.array(units):
+        model = A * unit[:, None] / unit, B * unit[:, None]
+        mpc = qm.LinearMPC(model, 20, Q=1 / unit**2, R=0.1, u_bounds=(-1.0, 1.0))
+        moves.append(qm.Controller(mpc).step(unit * [1.0, -1.0, 0.5, 0.3], np.zeros(4)))
+        names.append(mpc.design.disturbances.names)
+    assert names[0] == names[1]
+    assert np.allclose(*moves, atol=1e-7)
+
+
+def test_inputs_in_watts_and_in_megawatts_have_the_same_moves():
+    moves = []
+    for unit in (1.0, 1e-3, 1e-6):
+        s = np.array([unit, 1.0, unit])
+        mpc = qm.LinearMPC(
+            ([[1.0]], np.array([[-4.18e-6, 1.49, -1.32e-5]]) / s, [[1.9e-4]]),
+            10,
+            Q=521.0,
+            R=np.diag([4.36e-17, 2.58e-3, 9.88e-16] / s**2),
+            dR=np.diag([2.51e-16, 1.93e-4, 1.78e-15] / s**2),
+            u_bounds=([-2.1e6, -84.0, -5.1e7] * s, [9.5e6, 24.0, 5.8e7] * s),
+            du_bounds=([-1.05e6, -13.9, -2.1e7] * s, [6.1e6, 8.1, 2.6e7] * s),
+        )
+        controller = qm.Controller(mpc)
+        controller.reset(y=[0.0], u=[0.0, 0.0, 0.0])
+        moves.append([controller.step([y], [0.0]) / s for y in (0.0, 0.005, 0.02, 0.05)])
+    for other in moves[1:]:
+        assert np.abs((np.array(other) - moves[0]) / [5.8e6, 54.0, 5.4e7]).max() < 1e-7
+
+
+@pytest.mark.parametrize("gain", [1e-7, 1.0, 2e4, 1e7])
+def test_a_transfer_function_of_any_gain_is_controlled(gain):
+    system = scipy.signal.TransferFunction([gain], [10.0, 1.0])
+    mpc = qm.LinearMPC(system, 10, dt=1.0, Q=1 / gain**2, dR=0.1)
+    assert abs(mpc.target([0.5 * gain]).u.item() - 0.5) < 1e-6
+
+
+@pytest.mark.parametrize(("x", "u"), [(1e2, (1.0, 1e3)), (1e5, (1e-2, 1e5)), (1e-3, (1.0, 1e5))])
+@pytest.mark.parametrize("R", [0.0, 1.0])
+def test_the_terminal_weight_is_the_same_in_any_unit(x, u, R):
+    found = []
+    for x_unit, u_unit in ((1.0, np.ones(2)), (x, np.array(u))):
+        model = [[1.2]], np.array([[0.3, 0.2]]) * x_unit / u_unit
+        weights = {"Q": 1 / x_unit**2, "R": R / u_unit**2, "dR": [0.1, 0.05] / u_unit**2}
+        mpc = qm.LinearMPC(model, 5, **weights, u_bounds=(-u_unit, u_unit))
+        P, size = riccati(mpc.design), np.append(x_unit, u_unit)
+        found.append(None if P is None else P * np.outer(size, size))
+    assert (found[0] is None) == (found[1] is None) == (R == 0)
+    assert R == 0 or np.allclose(*found, rtol=1e-9)
+
+
+def test_a_remedy_names_a_weight_in_each_input_s_own_unit():
+    controller = two_by_two((1.0, 1.0), (1.0, 1e3), dR=None)
+    singular = qm.LinearMPC(
+        ([[0.9]], [[0.5, 4e-4]]), 10, Q=1.0, u_bounds=([-1.0, -1e3], [1.0, 1e3])
+    )
+    (fault,) = (x for x in qm.Controller(singular).review().faults if x.name == "cost")
+    assert "R={'u1': 0.01, 'u2': 1e-08}" in fault.remedy
+    assert controller.review()["cost"].ok
+
+
+def test_a_plant_without_a_steady_state_is_refused_in_any_unit():
+    for unit in (1.0, 1e6):
+        with pytest.raises(QPError, match="a mode at 1 that no input moves"):
+            qm.LinearMPC(([[1.0, 0.0], [0.0, 0.5]], [[0.0], [unit]]), 5, Q=1.0, R=0.1)
+
+
+@pytest.mark.parametrize("seed", [0, 5, 12, 15])
+def test_random_designs_in_random_units_have_the_same_moves(seed):
+    assert judged(seed, compiled=seed == 0)[0].startswith("controlled")

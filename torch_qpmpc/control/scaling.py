@@ -1,0 +1,95 @@
+"""The sizes of a plant's signals, in which all decisions about ranks and small numbers are made.
+
+A change of units multiplies a signal and its size alike, so it changes no decision.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from torch_qpmpc.control.state_space import Array, StateSpace
+
+#: The fewest steps of the responses that sizes follow from.
+STEPS = 20
+Bounds = tuple[Array, Array]
+
+
+class Scaling(NamedTuple):
+    """Sizes of the outputs ``(n_y,)``, inputs ``(m,)``, states ``(n,)`` and known signals.
+
+    Half the distance of its bounds is the size of an output or an input. Without bounds, an output
+    has the size of its response to a step of the inputs; and an input the size that moves some
+    output by its own, which is then ``1 / sqrt(Q_ii)`` if no input has bounds. A state's is between
+    what the inputs move and what shows in the outputs, and a known signal's moves a state by its.
+    """
+
+    y: Array
+    u: Array
+    x: Array
+    d: Array
+
+    @classmethod
+    def of(
+        cls,
+        plant: StateSpace,
+        y_bounds: Bounds | None = None,
+        u_bounds: Bounds | None = None,
+        Q: Array | None = None,
+        steps: int = 0,
+    ) -> Scaling:
+        """Return the sizes of a plant's signals, from responses of at least ``steps`` steps."""
+        n, m, n_y, _ = plant.sizes
+        growth = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max(initial=0.0))
+        A, count = plant.A / growth, max(steps, n, STEPS)  # modes that grow would hide the others
+        x, seen, shown = np.zeros((n, m)), plant.C, np.zeros((n_y, n))
+        X, Y = np.zeros((n, m)), np.zeros((n_y, m))
+        for _ in range(count):
+            x = A @ x + plant.B
+            X, Y = np.maximum(X, np.abs(x)), np.maximum(Y, np.abs(plant.C @ x))
+            shown, seen = np.maximum(shown, np.abs(seen)), seen @ A
+        y, u = (
+            np.zeros(k) if b is None else ranges(b) for k, b in ((n_y, y_bounds), (m, u_bounds))
+        )
+        weight = np.zeros(n_y) if Q is None else np.sqrt(np.diag(Q))
+        aimed = _first(y, (Y * u).max(1, initial=0.0), _inverse(weight))
+        u = _first(u, _inverse((Y * _inverse(aimed)[:, None]).max(0)), _inverse(Y.max(0)))
+        u = _first(u, _inverse(X.max(0)), np.ones(m))
+        y = _first(y, (Y * u).max(1, initial=0.0), aimed, np.ones(n_y))
+        moved = (X * u).max(1, initial=0.0)
+        shows = _inverse((shown * _inverse(y)[:, None]).max(0))
+        x = _first(np.sqrt(moved * shows), moved, shows, np.ones(n))
+        effect = (np.abs(plant.E) / x[:, None]).max(0)
+        return cls(y, u, x, _first(_inverse(effect), np.ones(len(effect))))
+
+    def plant(self, plant: StateSpace) -> StateSpace:
+        """Return a plant in signals divided by their sizes."""
+        y, u, x, d = self
+        matrices = (
+            plant.A * (x / x[:, None]),
+            plant.B * (u / x[:, None]),
+            plant.C * (x / y[:, None]),
+            plant.E * (d / x[:, None]),
+            plant.offset / x,
+        )
+        return StateSpace(*matrices, None, plant.inputs, plant.outputs, plant.known)
+
+
+def ranges(bounds: Bounds) -> Array:
+    """Return half the distance of the bounds, and zero where there is none."""
+    half = (bounds[1] - bounds[0]) / 2
+    return np.where(np.isfinite(half) & (half > 0), half, 0.0)
+
+
+def _first(*sizes: Array) -> Array:
+    """Return the first of the sizes that is not zero, for each entry."""
+    result = sizes[0]
+    for size in sizes[1:]:
+        result = np.where(result > 0, result, size)
+    return result
+
+
+def _inverse(size: Array) -> Array:
+    """Return the inverse, zero of zero."""
+    return np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
