@@ -200,7 +200,7 @@ def test_process_and_sensor_noise_may_be_one_source():
             data.append(trajectory(np.array(y), u))
         return data
 
-    model, L = fit_state_space(log(20), 3, 10).model, np.linalg.solve(A, K)
+    model, L = fit_state_space(log(20), lags=10).model, np.linalg.solve(A, K)
     none, S = np.zeros((3, 0)), 0.09 * np.eye(2)
     true = Innovations(A, B, none, np.zeros(3), C, L, S, np.zeros(3), np.zeros((3, 3)))
     np.testing.assert_allclose(model.S, S, atol=0.008)

@@ -5,10 +5,10 @@ outputs; the singular vectors of its predictions of the next p outputs are the s
 squares give their model. Expectation maximisation (Shumway and Stoffer 1982) then raises the
 likelihood of
 
-    x_{k+1} = A x_k + B u_k + E d_k + offset + w_k,   y_k = C x_k + v_k,   cov v = R,
+    x_{k+1} = A x_k + B u_k + E d_k + offset + w_k,   y_k = C x_k + v_k,   cov w = Q, cov v = R,
 
-and of the distribution of x_0. The noises may be correlated (Gibson and Ninness 2005), unless
-samples are missing. Signals are normalised, so that units decide nothing.
+and of the distribution of x_0. Noise that has one source in w and v, or is delayed, takes more
+states. Signals are normalised, so that units decide nothing.
 """
 
 from __future__ import annotations
@@ -35,17 +35,15 @@ FLOOR_Q, FLOOR_R = 1e-12, 1e-8
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
-#: Smaller singular values of A, relative to the largest, give no gain.
-RCOND = 1e-3
 #: Candidates, as far as the data allow; 0 states are the outputs alone.
 ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20), (2, 5, 10, 20)
-#: Parts of the log in cross-validation.
-PARTS = 2
+#: Parts of the log in cross-validation, which cuts longer trajectories.
+PARTS, LONG = 2, 200
 #: Steps of the predictions that decide.
 HORIZONS = (1, 2, 5, 10, 20)
 #: The smallest order is chosen whose squared errors are above the best's by less than this share,
 #: in the geometric mean. Errors below EXACT, as a share of the variance, are none.
-MARGIN, EXACT = 0.03, 1e-8
+MARGIN, EXACT = 0.004, 1e-8
 #: Autocorrelations of the residuals in the test of whiteness.
 CORRELATIONS = 20
 
@@ -81,11 +79,7 @@ class Signals(NamedTuple):
 
 
 class Noisy(NamedTuple):
-    """The model of the likelihood; B has the columns of u, d and 1.
-
-    With A' = A - F C and Q' = cov (w - F v), where F = cov (w, v) / R, the noise of
-    ``x+ = A' x + B v + F y + w'`` is independent of that of y. A, B, F and Q are these.
-    """
+    """The model of the likelihood; B has the columns of u, d and 1."""
 
     A: Array
     B: Array
@@ -94,7 +88,6 @@ class Noisy(NamedTuple):
     R: Array
     m0: Array
     P0: Array
-    F: Array
 
 
 def fit_state_space(
@@ -116,7 +109,12 @@ def fit_state_space(
     if order is None or (lags is None and order):
         orders = ORDERS if order is None else (order,)
         feasible = _feasible(data) if lags is None else (lags,)
-        parts = [normal.apply(part) for part in folds(trajectories, PARTS)]
+        short = [
+            one.between(first, min(first + LONG, one.steps))
+            for one in trajectories
+            for first in range(0, one.steps, LONG)
+        ]
+        parts = [normal.apply(part) for part in folds(short, PARTS)]
         rows = tuple(_compare(parts, orders, feasible, order is None))
         order, lags = _best(rows)[:2]
     if order:
@@ -220,7 +218,8 @@ class _Normal:
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
         y = [x.y.numpy() for x in trajectories]
         low, high = (np.array([f.reduce(x) for x in y]) for f in (np.fmin, np.fmax))
-        self.still = np.asarray(~(high > low).any(0))
+        moving = (high > low).any(0)
+        self.still = np.asarray(~moving & moving.any())
         self.held = np.where(np.isfinite(high), high, np.nanmean(high, 0))[:, self.still]
         self.n_u = trajectories[0].u.shape[1]
         self.y, self.y_size = _scale(np.concatenate(y)[:, ~self.still])
@@ -356,16 +355,7 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
     w, r = X1 - V @ AB.T, F - X0 @ C.T
     Q = w.T @ w / len(w) + 1e-6 * np.eye(order)
     R = r.T @ r / len(r) + 1e-9 * np.eye(len(C))
-    return Noisy(
-        AB[:, :order],
-        AB[:, order:],
-        C,
-        Q,
-        R,
-        np.linalg.pinv(C) @ first,
-        np.eye(order),
-        np.zeros((order, len(C))),
-    )
+    return Noisy(AB[:, :order], AB[:, order:], C, Q, R, np.linalg.pinv(C) @ first, np.eye(order))
 
 
 def _filled(y: Array) -> Array:
@@ -394,13 +384,13 @@ class _Moments(NamedTuple):
 
 def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
     """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``; None if all is ``seen``."""
-    A, B, C, Q, R, m, P, F = par
+    A, B, C, Q, R, m, P = par
     G, N, n = len(y), y.shape[1], len(A)
     g = 1 if seen is None else G
     m, P = np.broadcast_to(m, (G, n)), np.broadcast_to(P, (g, n, n))
     prior, post = np.empty((N, G, n)), np.empty((N, G, n))
     before, after = np.empty((N, g, n, n)), np.empty((N, g, n, n))
-    same, value, inputs = np.zeros(N, dtype=bool), 0.0, np.moveaxis(v @ B.T + y[:, :-1] @ F.T, 0, 1)
+    same, value, inputs = np.zeros(N, dtype=bool), 0.0, np.moveaxis(v @ B.T, 0, 1)
     L = inverse = half = Ct = np.zeros(0)
     for t in range(N):
         if t:
@@ -464,12 +454,9 @@ def _maximise(par: Noisy, batches: list, moments: list[_Moments], n: int) -> Noi
     Szz: Any = 0.0
     Sx1 = S11 = Syx = Sxx = Syy = first = Szz
     N = M = 0
-    joint = all(seen is None for _, seen in batches)  # of missing samples
-    n_v = par.B.shape[1]
     for ((y, v), seen), (x, P, cross, _) in zip(batches, moments, strict=True):
         G = len(y) / P.shape[1]
-        z = np.concatenate((x[:, :-1], v, y[:, :-1] if joint else y[:, :-1, :0]), -1)
-        z = z.reshape(-1, z.shape[-1])
+        z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
         x1, all_x, ys = x[:, 1:].reshape(-1, n), x.reshape(-1, n), y.reshape(-1, y.shape[-1])
         zz, xz = z.T @ z, x1.T @ z
         zz[:n, :n] += G * P[:-1].sum((0, 1))
@@ -496,8 +483,7 @@ def _maximise(par: Noisy, batches: list, moments: list[_Moments], n: int) -> Noi
     C = np.linalg.solve(_lifted(Sxx), Syx.T).T
     Q = _positive((S11 - AB @ Sx1.T) / N, FLOOR_Q)
     R = _positive((Syy - C @ Syx.T) / M, FLOOR_R)
-    F = AB[:, n + n_v :] if joint else par.F
-    return Noisy(AB[:, :n], AB[:, n : n + n_v], C, Q, R, m0, _positive(P0, FLOOR_Q), F)
+    return Noisy(AB[:, :n], AB[:, n:], C, Q, R, m0, _positive(P0, FLOOR_Q))
 
 
 def _lifted(S: Array) -> Array:
@@ -514,7 +500,7 @@ def _positive(M: Array, floor: float) -> Array:
 
 def steady(par: Noisy) -> Innovations:
     """Return the filter's steady state."""
-    A, B, C, Q, R, m0, P0, F = par
+    A, B, C, Q, R, m0, P0 = par
     try:
         P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
     except (ValueError, np.linalg.LinAlgError):  # a mode that nothing excites settles slowly
@@ -522,10 +508,9 @@ def steady(par: Noisy) -> Innovations:
         for _ in range(1000):
             P = A @ (P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)) @ A.T + Q
             P = (P + P.T) / 2
-    S, whole = C @ P @ C.T + R, A + F @ C
-    K = A @ np.linalg.solve(S, C @ P).T + F
-    L = np.linalg.lstsq(whole, K, rcond=RCOND)[0]
-    return Innovations(whole, B, np.zeros((len(A), 0)), np.zeros(len(A)), C, L, S, m0, P0 - P)
+    S = C @ P @ C.T + R
+    L = np.linalg.solve(S, C @ P).T
+    return Innovations(A, B, B[:, :0], np.zeros(len(A)), C, L, S, m0, P0 - P)
 
 
 def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
@@ -533,7 +518,7 @@ def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
     n, C = len(model.A), model.C
     xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for (y, v), _ in _batches(data)]
     cov = np.cov(np.concatenate(xi).T, bias=True).reshape(n, n)
-    root = np.linalg.cholesky(cov + 1e-12 * np.eye(n))
+    root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(n))
     _, s, Vh = np.linalg.svd(C @ root)
     hidden = np.linalg.solve(root.T, Vh[int((s > HIDDEN * s[0]).sum()) :].T).T
     hidden *= np.sign(hidden[np.arange(len(hidden)), np.abs(hidden).argmax(1)])[:, None]
