@@ -181,8 +181,7 @@ def _train(
             if evaluated:
                 evaluation.evaluate(gate.policy)
                 if last:
-                    held = () if identified is None else identified.outputs_held
-                    evaluation.identify(partial(transitions, identified, replay), held)
+                    evaluation.identify(partial(transitions, identified, replay))
                 gap = report(run, gate.mpc, evaluation, update)
                 closed = gap["closed_gap"]
                 known = {"closed_gap": closed} if math.isfinite(closed) else {}

@@ -1,4 +1,4 @@
-"""A small plant with previews, hidden states and noise: a store that is filled by price."""
+"""A small plant with previews and noise: a store that is filled by price."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
-from torchrl.envs import TransformedEnv
 
 from torch_qpmpc import QPMPC, Bounds, Cost, Model, QPActorValueOperator, Scheme
-from torch_qpmpc.envs import PastWindow, Plant, PlantEnv
+from torch_qpmpc.envs import Plant, PlantEnv
 from torch_qpmpc.envs.linear_system import Rng, float64, normal, uniform
 
 LEARN = ("H", "H_f", "q", "c", "w", "C", "b", "G", "lb", "ub")
@@ -18,9 +18,9 @@ LEARN = ("H", "H_f", "q", "c", "w", "C", "b", "G", "lb", "ub")
 
 @dataclass(frozen=True, eq=False)
 class Store(Plant):
-    """A level l and a pump v, of which only l is measured, with prices and demands known ahead.
+    """A level l and a pump v, with prices and demands known ahead.
 
-    v+ = 0.5 v + 0.5 u,    l+ = l + v - demand + noise,    y = l + noise
+    v+ = 0.5 v + 0.5 u,    l+ = l + v - demand + noise,    y = [l + noise, v]
 
     w is [price, demand, noise of the level, noise of the output].
     """
@@ -29,10 +29,9 @@ class Store(Plant):
     _: KW_ONLY
     lb_a: Tensor = field(default_factory=float64(0))
     ub_a: Tensor = field(default_factory=float64(1))
-    n_y: int = 1
+    n_y: int = 2
     n_d: int = 2
     horizon: int = 3
-    past: int = 2
 
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
         known, noise = uniform(rng, count, length, 2), normal(rng, count, length, 2)
@@ -43,7 +42,7 @@ class Store(Plant):
         return torch.cat((level, torch.zeros_like(level)), -1)
 
     def output(self, x: Tensor, w: Tensor) -> Tensor:
-        return x[..., :1] + w[..., 3:]
+        return torch.cat((x[..., :1] + w[..., 3:], x[..., 1:]), -1)
 
     def cost(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         return w[..., 0] * u[..., 0] + self.violation(x, w)
@@ -58,20 +57,26 @@ class Store(Plant):
 
 
 def scheme(plant: Store, gamma: float = 0.9) -> Scheme:
-    """Return an ARX model, prices in the cost, soft bounds and, with a window, rate limits."""
-    lags, one = plant.past - 1, torch.ones(1, dtype=torch.float64)
-    weight = 0.1 * torch.eye(4, dtype=torch.float64)
-    weight[0, 3] = weight[3, 0] = 1.0
-    A = torch.tensor([[1.5, *[-0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
-    B = torch.tensor([[0.0, *[0.5][:lags], *[0.0] * (lags - 1)]], dtype=torch.float64)
+    """Return the true model, prices in the cost and soft bounds of the level.
+
+    An observer's further states have a small weight, and nothing moves them.
+    """
+    n, rest = plant.n_x, plant.n_x - 2
+    weight = 0.1 * torch.eye(2 + n + 1, dtype=torch.float64)
+    weight[0, -1] = weight[-1, 0] = 1.0
+    low = torch.full((n,), -torch.inf, dtype=torch.float64)
+    high = -low
+    low[0], high[0] = 1.0, 2.0
     bounds = Bounds(
-        state_bounds=(one, 2 * one),
-        action_bounds=(plant.lb_a, plant.ub_a),
-        rate_bounds=(-0.6 * one, 0.6 * one) if lags else None,
-        state_slack=2.0,
-        rate_slack=1.0 if lags else torch.inf,
+        state_bounds=(low, high), action_bounds=(plant.lb_a, plant.ub_a), state_slack=2.0
     )
-    model, cost = Model(A, B, E=[[0.0, -1.0]]), Cost(weight, hessian="block")
+    A, B, E = (
+        torch.tensor(matrix, dtype=torch.float64)
+        for matrix in ([[1.0, 1.0], [0.0, 0.5]], [[0.0], [0.5]], [[0.0, -1.0], [0.0, 0.0]])
+    )
+    below = (0, 0, 0, rest)
+    model = Model(F.pad(A, (0, rest, 0, rest)), F.pad(B, below), E=F.pad(E, below))
+    cost = Cost(weight, hessian="block")
     return Scheme(model.layout(plant.horizon), model, cost, bounds, gamma)
 
 
@@ -89,5 +94,5 @@ def collect(count: int, steps: int, seed: int = 0, dtype: torch.dtype = torch.fl
     """Collect ``(count, steps)`` transitions of random actions in episodes of 7 steps."""
     torch.manual_seed(seed)
     plant = Store()
-    env = TransformedEnv(PlantEnv(plant, count, 7, dtype, seed=seed), PastWindow(plant.past))
+    env = PlantEnv(plant, count, 7, dtype, seed=seed)
     return env.rollout(steps, break_when_any_done=False)

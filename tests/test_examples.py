@@ -22,14 +22,14 @@ SHORT = (
 NAMES = sorted(x.stem for x in FOLDER.glob("*.py") if "register(" in x.read_text("utf-8"))
 
 
-@pytest.mark.parametrize("name", [*NAMES, "actuator_noise task.hidden_velocity=true"])
+@pytest.mark.parametrize("name", NAMES)
 def test_an_example_learns_for_two_updates(name, tmp_path):
-    name, *more = name.split()
     file = FOLDER / f"{name}.py"
-    run_command(f"task.file={file}", *SHORT, *more, f"hydra.run.dir={tmp_path}")
+    run_command(f"task.file={file}", *SHORT, f"hydra.run.dir={tmp_path}")
     summary = read_summary(tmp_path)
     assert (summary["task"], summary["updates"], summary["unsolved"]) == (name, 2, 0)
-    assert all(math.isfinite(summary[f"J_{end}"]) for end in ("start", "final", "true_model"))
+    ends = ("start", "final", "true_model")[: 2 + (TASKS[name].true_scheme is not None)]
+    assert all(math.isfinite(summary[f"J_{end}"]) for end in ends)
     assert {*TASKS[name].rivals} <= {*summary["rivals"]}
     assert (tmp_path / "episode.png").exists()
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 200

@@ -278,7 +278,10 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("task.id: got NoneType, expected a str.", lambda: GymnasiumPlant(None)),
     ("max_steps: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(1, 0, 1)),
     ("s: got shape (2,), expected shape (*batch, 3).", lambda: pendulum.violation(zeros(2))),
-    ("resume: got /nonexistent, without config.yaml", lambda: resumed("/nonexistent", [])),
+    (
+        "resume: got /nonexistent, which does not exist, expected a run",
+        lambda: resumed("/nonexistent", []),
+    ),
     ("resume: got it together with seed=2, expected no other", lambda: resumed("/x", ["seed=2"])),
     ("resume: got None, expected a path.", lambda: resumed(None, [])),
 ]

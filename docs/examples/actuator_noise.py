@@ -4,21 +4,20 @@
 
 A known linear model predicts the mean of x+, but a large action makes the next state uncertain.
 Without active bounds the optimal policy is linear (Wonham, SIAM J. Control 1967; de Koning,
-Automatica 1982). With task.hidden_velocity=true only the position is measured: an action moves it
-two steps later, and the optimal policy is linear in the window [p_{k-1}, u_{k-1}, p_k].
+Automatica 1982).
 
     python train.py task.file=docs/examples/actuator_noise.py weighted=true
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, Scheme
+from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
@@ -27,7 +26,6 @@ from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, plant
 from torch_qpmpc.mpc.riccati import riccati_weight
 
 STARTS = 256  # closed loops of an evaluation: costs under this noise have heavy tails
-LONG = 30  # the least horizon of a window's true scheme, whose terminal weight is the stage's
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,46 +55,14 @@ class ActuatorNoise(Plant):
     def step(self, x, u, w):
         return x @ self.A.mT + (1 + w[..., :1]) * u @ self.B.mT + w[..., 1:]
 
-    def mean_model(self):
-        return Model(self.A, self.B)
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class HiddenVelocity(ActuatorNoise):
-    """An Euler step in place of the exact one, y = position; the velocity is free and starts at 0.
-
-    Two positions show the last step's velocity: what the noise has done since is seen a step later.
-    """
-
-    n_y: int = 1
-    past: int = 2
-    horizon: int = 2
-    B: Tensor = field(default_factory=float64([0], [0.2]))
-    W: Tensor = field(default_factory=float64([1, 0, 0], [0, 0, 0], [0, 0, 0.01]))
-
-    def signals(self, rng, count, length):
-        return super().signals(rng, count, length) * self.A.new_tensor([1, 0, 1])
-
-    def starts(self, rng, count):
-        return super().starts(rng, count) * self.A.new_tensor([1, 0])
-
-    def output(self, x, w):
-        return x[..., :1]
-
-    def mean_model(self):
-        return Model(self.A.new_tensor([[2, -1]]), self.A.new_tensor([[0, 0.04]]))
-
-
-def noisy_stage_weight(A, B, W, gamma, std, delay=0):
+def noisy_stage_weight(A, B, W, gamma, std):
     """Return W with gamma std^2 B'PB added to the weight of u: the regulator is then optimal.
 
-    P solves the generalised Riccati equation. What xi does is seen ``delay`` steps later only: the
-    errors of the state's mean cost the stages until then, which no action can change.
+    P solves the generalised Riccati equation.
     """
     P, weight = riccati_weight(A, B, W, gamma), W
     for _ in range(10_000):
-        for _ in range(delay):
-            P = W[:-1, :-1] + gamma * A.mT @ P @ A
         last, weight = weight, W.clone()
         weight[-1, -1] += gamma * std**2 * (B.mT @ P @ B).item()
         if torch.allclose(weight, last, rtol=1e-12, atol=0):
@@ -105,65 +71,46 @@ def noisy_stage_weight(A, B, W, gamma, std, delay=0):
     raise ValueError("under this noise no policy has a finite cost")
 
 
-def measured(plant, W):
-    """Return the weight of the measured states and the action and, with a window, of x_N."""
-    seen = [*range(plant.n_y), -1]
-    return W[seen][:, seen], W[:1, :1] if plant.past > 1 else None
-
-
 def make_plant(cfg):
     task = cfg.task
     bounds = {"lb_a": float64(-task.a_max)(), "ub_a": float64(task.a_max)()}
-    kind = HiddenVelocity if task.hidden_velocity else ActuatorNoise
-    return kind(horizon=task.horizon, actuator_std=task.actuator_std, **bounds)
+    return ActuatorNoise(horizon=task.horizon, actuator_std=task.actuator_std, **bounds)
 
 
 def wrong_scheme(cfg, plant):
     """Return MPC with the true mean and the plant's cost: certainty equivalence."""
-    return scheme(cfg, plant, plant.W)
+    return plant_scheme(cfg, plant, Model(plant.A, plant.B), plant.W)
 
 
 def true_scheme(cfg, plant):
     """Return the same scheme with the noise's weight, which is optimal while no bound is active."""
-    delay = plant.past - 1
-    args = (plant.A, plant.B, plant.W, cfg.task.gamma, plant.actuator_std, delay)
-    exact = scheme(cfg, plant, noisy_stage_weight(*args))
-    return replace(exact, layout=plant_layout(plant, max(LONG, plant.horizon))) if delay else exact
-
-
-def scheme(cfg, plant, W):
-    stage, terminal = measured(plant, W)
-    found = plant_scheme(cfg, plant, plant.mean_model(), stage)
-    if terminal is None:
-        return found
-    return replace(found, cost=replace(found.cost, terminal_weight=terminal))
+    weight = noisy_stage_weight(plant.A, plant.B, plant.W, cfg.task.gamma, plant.actuator_std)
+    return plant_scheme(cfg, plant, Model(plant.A, plant.B), weight)
 
 
 def heavier(plant, factor):
     """Make MPC of the mean without discount, with a heavier action: its weight, tuned by hand."""
     W = plant.W.clone()
     W[-1, -1] *= factor
-    layout = Layout(plant.n_y, 1, plant.horizon, plant.past)
     bounds = Bounds(action_bounds=(plant.lb_a, plant.ub_a))
-    cost = Cost(*measured(plant, W), hessian="block")
-    tuned = Scheme(layout, plant.mean_model(), cost, bounds, gamma=1.0)
+    layout, model = plant_layout(plant, plant.horizon), Model(plant.A, plant.B)
+    tuned = Scheme(layout, model, Cost(W, hessian="block"), bounds, gamma=1.0)
     return QPMPC(tuned, learn=(), solver="daqp").policy
 
 
 def episode(plant, d):
-    return {"outputs": ["position", "velocity"][: plant.n_y], "actions": ["acceleration"]}
+    return {"outputs": ["position", "velocity"], "actions": ["acceleration"]}
 
 
 class Settings(TaskSettings):
     actuator_std: NonNegative  # of the factor of the action
     a_max: Positive  # bound of the absolute action
-    hidden_velocity: bool  # only the position is measured
 
 
 OPTIONS = {"solver": "daqp", "steps_per_update": 10, "warmup_steps": 40, "updates": 60}
 OPTIONS |= {"batch_size": 2000, "eval_interval": 10, "exploration_std": 0.5, "gate": False}
 OPTIONS |= {"defaults": [{"override /constraint": "free"}]}
-TASK = {"horizon": 5, "gamma": 0.95, "actuator_std": 1.2, "a_max": 10.0, "hidden_velocity": False}
+TASK = {"horizon": 5, "gamma": 0.95, "actuator_std": 1.2, "a_max": 10.0}
 TASK |= {"episode_steps": 10, "eval_steps": 100, "hessian": "block", "terminal_weight": "riccati"}
 TASK |= {"learn_cost": ["H", "H_f", "c"]}
 register(

@@ -24,7 +24,7 @@ from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
-from torch_qpmpc.experiment.fields import Count, NonNegative
+from torch_qpmpc.experiment.fields import NonNegative
 from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, priced, register
 from torch_qpmpc.mpc.banded import band_distance
 
@@ -90,7 +90,7 @@ def heating_scheme(house, model, gamma=1.0, margin=0.0, c=0.0):
     H[PRICE, -1] = H[-1, PRICE] = DT
     H[-1, -1] = 2e-5  # makes a plan unique
     D = torch.zeros(2, n_d + n_x + 1).double()
-    D[:, n_d] = 1.0
+    D[:, n_d] = 1.0  # the first state is the air
     D[0, LOWER] = D[1, UPPER] = -1.0
     lower, upper = H.new_tensor([margin, -torch.inf]), H.new_tensor([torch.inf, 0.0])
     bounds = Bounds(
@@ -105,14 +105,14 @@ def heating_scheme(house, model, gamma=1.0, margin=0.0, c=0.0):
 
 
 def known_model(house):
-    """Return the true model without the gain, with coefficients of zero for earlier outputs."""
-    A, B, E = house.model()
-    lags = (0, house.past - 1)
-    return Model(pad(A, lags), pad(B, lags), E[:, :GAIN])
+    """Return the true model without the gain; further states of an observer have no effect."""
+    (A, B, E), rest = house.model(), house.n_x - 1
+    B, E = (pad(matrix, (0, 0, 0, rest)) for matrix in (B, E[:, :GAIN]))
+    return Model(pad(A, (0, rest, 0, rest)), B, E)
 
 
 def make_plant(cfg):
-    return House(horizon=cfg.task.horizon, past=cfg.task.past)
+    return House(horizon=cfg.task.horizon)
 
 
 def wrong_scheme(cfg, house):
@@ -149,7 +149,7 @@ class Omniscient:
     def __call__(self, p):
         ahead = self.w[:, self.k : self.k + self.house.horizon + 1]
         self.k += 1
-        return self.mpc.policy(torch.cat((ahead.flatten(1), p[:, -1:]), -1))
+        return self.mpc.policy(torch.cat((ahead.flatten(1), p[:, [self.house.n_preview]]), -1))
 
 
 def thermostat(house):
@@ -157,7 +157,7 @@ def thermostat(house):
 
     def policy(p):
         d = p[:, : house.n_preview].unflatten(-1, (house.horizon + 1, house.n_d))
-        return 10.0 * (d[:, :9, LOWER].amax(1, keepdim=True) + 0.75 - p[:, -1:])
+        return 10.0 * (d[:, :9, LOWER].amax(1, keepdim=True) + 0.75 - p[:, [house.n_preview]])
 
     return policy
 
@@ -174,13 +174,12 @@ def episode(house, d):
 
 
 class Settings(TaskSettings):
-    past: Count  # outputs in the window
     margin: NonNegative  # distance to the lower bound, in K, at which the planned violation begins
 
 
 OPTIONS = {"solver": "daqp", "num_envs": 4, "exploration_std": 1.0, "warmup_steps": 96}
 OPTIONS |= {"gate": "act", "gate_interval": None, "defaults": [{"override /constraint": "free"}]}
-TASK = {"horizon": 32, "past": 1, "gamma": 0.95, "episode_steps": DAY, "eval_steps": DAY}
+TASK = {"horizon": 32, "gamma": 0.95, "episode_steps": DAY, "eval_steps": DAY}
 TASK |= {"margin": 0.0, "hessian": "block", "learn_cost": ["q", "c"], "discount_slack": True}
 TASK |= {"terminal_weight": "identity"}
 register(

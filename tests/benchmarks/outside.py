@@ -4,8 +4,8 @@ Each plant is a Gymnasium id, with a shim where its package has none, and its st
 
     python train.py task=gymnasium task.id=ID start=data
 
-Beside it are zero action, random actions, the start without a choice (``task.start_episodes=0``)
-and the plant's own reference, in the same episodes, which chose nothing. The packages are optional:
+Beside it are zero action and a reference that knows the plant, in the same episodes, which chose
+nothing. The packages are optional:
 
     pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor anesthesim
     pip install --no-deps controlgym building-energy-storage-simulation 'setuptools<81'
@@ -37,7 +37,7 @@ from omegaconf import DictConfig
 from scipy.optimize import linprog
 
 import train
-from tests.benchmarks.table import DOCS, two_tables
+from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -45,7 +45,6 @@ from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
-from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -54,16 +53,8 @@ RESULTS = DOCS / "results" / "outside.csv"
 SEEDS, EVAL_SEED = (1, 2, 3), 9002
 #: Rows of the table: a cost that is above zero action's by more than this many standard errors.
 ERRORS = 2.0
-FIELDS = ("plant", "seed", "zero", "random", "own", "start", "excess", "error", "chosen", "R2_cost")
-FIELDS += ("reference", "learned", "transitions", "choosing", "simulated", "seconds")
-#: Columns of J in the table, by field.
-COLUMNS = {
-    "zero": "zero action",
-    "random": "random",
-    "own": "start without a choice",
-    "start": "start",
-    "reference": "reference",
-}
+FIELDS = ("plant", "seed", "zero", "random", "start", "excess", "error", "chosen", "R2_cost")
+FIELDS += ("order", "reference", "learned", "transitions", "choosing", "simulated", "seconds")
 #: The module that `gymnasium.make` imports for an id of a shim.
 HERE = "tests.benchmarks.outside"
 
@@ -74,7 +65,6 @@ class Outside(NamedTuple):
     Attributes:
         id: as in ``task.id``.
         package: the one that it needs, as Python imports it.
-        tuned: True if settings were chosen with it.
         reference: returns J of its own controller; None for the reward that its package calls
             solved, if it has one.
         overrides: further ones of train.py.
@@ -82,7 +72,6 @@ class Outside(NamedTuple):
 
     id: str
     package: str
-    tuned: bool
     reference: Callable[[], float] | None = None
     overrides: Sequence[str] = ()
 
@@ -231,10 +220,34 @@ def controlgym(plant: str) -> Any:
 
 
 def controlgym_lqg(plant: str) -> float:
-    """Return J of controlgym's LQG, which has the true model."""
+    """Return J of LQG with the true matrices, the limits of the action and an unknown first state.
+
+    The filter begins with the distribution of the first states of 1,000 resets.
+    """
     env = controlgym(plant)
     lqg = import_module("controlgym.controllers").LQG(env)
-    costs = [-lqg.run(seed=EVAL_SEED + i) for i in range(32)]
+    A, B, C = env.A, env.B2, env.C
+    if hasattr(env, "B1"):
+        W, V = (env.noise_cov * x @ x.T for x in (env.B1, env.D21))
+    else:
+        W, V = env.process_noise_cov * np.eye(len(A)), env.sensor_noise_cov * np.eye(len(C))
+    first = np.array([env.reset(seed=i)[1]["state"] for i in range(1000)])
+
+    def corrected(x: Any, P: Any, y: Any) -> Any:
+        gain = P @ C.T @ np.linalg.pinv(C @ P @ C.T + V)
+        return x + gain @ (y - C @ x), P - gain @ C @ P
+
+    costs = []
+    for i in range(32):
+        y, over, J = env.reset(seed=EVAL_SEED + i)[0], False, 0.0
+        x, P = corrected(first.mean(0), np.cov(first.T).reshape(A.shape), y)
+        while not over:
+            u = np.clip(lqg.select_action(x), -1.0, 1.0)
+            y, reward, terminated, truncated, _ = env.step(u)  # y is of the state before
+            x, P = corrected(x, P, y)
+            x, P = A @ x + B @ u, A @ P @ A.T + W
+            J, over = J - float(reward), terminated or truncated
+        costs.append(J)
     return float(np.mean(costs))
 
 
@@ -299,48 +312,49 @@ def _registered(name: str, make: Callable[..., gymnasium.Env], steps: int) -> st
     return f"{HERE}:{name}"
 
 
-def _pcgym(model: str, tuned: bool) -> Outside:
+def _pcgym(model: str) -> Outside:
     name = f"Pcgym-{model}-v0"
     id = _registered(name, partial(PcGym, model), PCGYM[model]["N"])
-    return Outside(id, "pcgym", tuned, partial(pcgym_oracle, model))
+    return Outside(id, "pcgym", partial(pcgym_oracle, model))
 
 
-def _controlgym(plant: str, *overrides: str, tuned: bool = False) -> Outside:
+def _controlgym(plant: str, *overrides: str) -> Outside:
     id = _registered(f"Controlgym-{plant}-v0", partial(ControlGym, plant), 100)
-    return Outside(id, "controlgym", tuned, partial(controlgym_lqg, plant), overrides)
+    return Outside(id, "controlgym", partial(controlgym_lqg, plant), overrides)
 
 
 LUNAR = ("task.kwargs={continuous: true}",)
 PLANTS = {
-    "Pendulum": Outside("Pendulum-v1", "gymnasium", True),
-    "Inverted pendulum": Outside("InvertedPendulum-v5", "mujoco", True),
-    "Inverted double pendulum": Outside("InvertedDoublePendulum-v5", "mujoco", True),
-    "Reacher": Outside("Reacher-v5", "mujoco", True),
-    "pcgym cstr": _pcgym("cstr", True),
-    "pcgym four_tank": _pcgym("four_tank", True),
-    "pcgym multistage_extraction": _pcgym("multistage_extraction", True),
-    "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium", False),
-    "Lunar lander": Outside("LunarLander-v3", "Box2D", True, None, LUNAR),
-    "Swimmer": Outside("Swimmer-v5", "mujoco", False),
-    "controlgym psm": _controlgym("psm", tuned=True),
-    "controlgym dis1": _controlgym("dis1", tuned=True),
-    "controlgym he1": _controlgym("he1", tuned=True),
-    "controlgym he1, log of short episodes": _controlgym(
-        "he1", "task.episode_steps=20", tuned=True
-    ),
-    "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor", False),
-    # Chosen, with their settings, before any of their rows was seen.
+    "Pendulum": Outside("Pendulum-v1", "gymnasium"),
+    "Inverted pendulum": Outside("InvertedPendulum-v5", "mujoco"),
+    "Inverted double pendulum": Outside("InvertedDoublePendulum-v5", "mujoco"),
+    "Reacher": Outside("Reacher-v5", "mujoco"),
+    "pcgym cstr": _pcgym("cstr"),
+    "pcgym four_tank": _pcgym("four_tank"),
+    "pcgym multistage_extraction": _pcgym("multistage_extraction"),
+    "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium"),
+    "Lunar lander": Outside("LunarLander-v3", "Box2D", None, LUNAR),
+    "Swimmer": Outside("Swimmer-v5", "mujoco"),
+    "controlgym psm": _controlgym("psm"),
+    "controlgym dis1": _controlgym("dis1"),
+    "controlgym he1": _controlgym("he1"),
+    "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
+    "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor"),
     "controlgym ac5": _controlgym("ac5"),
     "controlgym he2": _controlgym("he2"),
     "controlgym umv": _controlgym("umv"),
+    "controlgym cm1": _controlgym("cm1"),
+    "controlgym toy": _controlgym("toy"),
+    "controlgym je2": _controlgym("je2"),
+    "controlgym he4": _controlgym("he4"),
     "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
     "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
-    "pcgym heat_exchanger": _pcgym("heat_exchanger", False),
-    "pcgym nonsmooth_control": _pcgym("nonsmooth_control", False),
+    "pcgym heat_exchanger": _pcgym("heat_exchanger"),
+    "pcgym nonsmooth_control": _pcgym("nonsmooth_control"),
     "Battery in a building": Outside(
-        _registered("Battery-v0", Battery, WEEK), BATTERY, False, battery_plans
+        _registered("Battery-v0", Battery, WEEK), BATTERY, battery_plans
     ),
-    "Propofol": Outside(PROPOFOL, "anesthesim", False, propofol_rule),
+    "Propofol": Outside(PROPOFOL, "anesthesim", propofol_rule),
 }
 
 
@@ -373,12 +387,7 @@ def run(name: str, seed: int) -> dict[str, Any]:
         start = make_start(cfg, physics, folder, written=False)
         assert start is not None
     seconds = time.process_time() - began
-    own = identified_start(cfg, physics, start.log)
-    policies = {
-        "zero": zero_action(physics),
-        "random": _random(physics, seed),
-        "own": warm_policy(make_mpc(cfg, physics, own)),
-    }
+    policies = {"zero": zero_action(physics), "random": _random(physics, seed)}
     costs = {key: _costs(cfg, physics, policy) for key, policy in policies.items()}
     plant = start.plant(physics)
     costs["start"] = _costs(cfg, plant, warm_policy(make_mpc(cfg, plant, start)))
@@ -387,8 +396,8 @@ def run(name: str, seed: int) -> dict[str, Any]:
     row |= {"excess": excess.mean().item(), "error": (excess.std() / len(excess) ** 0.5).item()}
     summary = start.summary
     row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
-    row |= {"R2_cost": start.cost.best.R2 if start.cost else math.nan}
-    row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
+    row |= {"R2_cost": start.cost.R2 if start.cost else math.nan, "order": summary["order"]}
+    row |= {"reference": reference(PLANTS[name]), "transitions": 2 * cfg.start.transitions}
     return row | {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
 
 
@@ -406,7 +415,7 @@ def learned(name: str, seed: int, start: float) -> dict[str, Any]:
         raise ValueError(f"{message}; delete the row to repeat it")
     steps = cfg.num_envs * (cfg.warmup_steps + cfg.updates * cfg.steps_per_update)
     entries = {"learned": summary["J_best"], "simulated": summary["simulated"]}
-    return entries | {"transitions": cfg.start.transitions + steps}
+    return entries | {"transitions": 2 * cfg.start.transitions + steps}
 
 
 def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any) -> torch.Tensor:
@@ -425,22 +434,23 @@ def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
     return policy
 
 
-def outcomes(rows: Any, tuned: bool) -> str:
-    """Format the rows of the plants that chose settings or, if not ``tuned``, of the others."""
+def outcomes(rows: Any) -> str:
+    """Format the rows, each plant with the median and the worst of its logs."""
     lines = []
-    for name, plant in PLANTS.items():
+    for name in PLANTS:
         runs = rows[rows["plant"] == name]
-        if plant.tuned != tuned or not len(runs):
+        if not len(runs):
             continue
-        J = [float(runs[key].mean()) for key in COLUMNS]
+        J = [float(runs[key].median()) for key in ("zero", "start")]
+        J += [float(runs["start"].max()), float(runs["reference"].median())]
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse = (runs["excess"] > ERRORS * runs["error"]).sum()
-        counts = f"{runs['choosing'].mean():,.0f}"
-        chosen = "; ".join(dict.fromkeys(runs["chosen"]))
-        tail = [f"{worse} of {len(runs)}", f"{runs['R2_cost'].mean():.2f}", counts, chosen]
+        names = (name.removesuffix(", first log") for name in runs["chosen"])
+        orders = ", ".join(map(str, runs["order"]))
+        tail = [f"{worse} of {len(runs)}", "; ".join(dict.fromkeys(names)), orders]
         lines.append([name, *cells, *tail])
-    head = ["plant", *COLUMNS.values(), "worse than zero action", "R2 of the cost"]
-    return two_tables([*head, "transitions of the choice", "chosen"], lines, len(head) - 1)
+    head = ["plant", "zero action", "start, median", "worst", "reference"]
+    return table([*head, "worse than zero action", "chosen", "states"], lines)
 
 
 def learning(rows: Any) -> str:
@@ -506,8 +516,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 add(options.results, row | (new := learned(name, seed, row["start"])))
                 print(name, seed, *new.values(), flush=True)
     rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
-    tables = {"tuned": outcomes(rows, True), "others": outcomes(rows, False)}
-    for marker, content in {**tables, "learned": learning(rows)}.items():
+    for marker, content in {"starts": outcomes(rows), "learned": learning(rows)}.items():
         text = replaced(text, content, marker)
     options.page.write_text(text, encoding="utf-8")
 

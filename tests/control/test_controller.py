@@ -94,20 +94,8 @@ def test_a_reset_starts_where_the_plant_rests():
     assert np.allclose(controller.step([3.0], [3.0]), [0.0])
 
 
-def identified(seed=0):
-    """Identify a plant with two lags, two outputs and two inputs from a log without noise."""
-    rng = np.random.default_rng(seed)
-    u, ys = rng.uniform(-1, 1, (200, 2)), []
-    x: Any = np.zeros(4)
-    for k in range(200):
-        ys.append(PAIR[2] @ x)
-        x = PAIR[0] @ x + PAIR[1] @ u[k]
-    log = qm.read_log({"y": np.array(ys), "u": u}, outputs=["y1", "y2"], inputs=["u1", "u2"])
-    return qm.identify(log, 1, past=2, structure="tied")
-
-
 def test_a_window_determines_the_estimates_and_leaves_no_offset(tmp_path):
-    mpc = qm.LinearMPC(identified(), 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0))
+    mpc = qm.LinearMPC(PAIR, 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0))
     controller = qm.Controller(mpc, window=True)
     controller.reset(y=[5.0, -5.0])  # another past, forgotten after three steps
     errors, load, bias = [], np.array([0.2, -0.1]), np.array([0.3, 0.1])

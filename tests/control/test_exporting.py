@@ -133,6 +133,8 @@ def test_missing_outputs_are_predicted_through_and_implausible_set_points_hold_t
         assert twin.step([0.1], [1.0])[1] == 0
     assert np.ptp(inputs, axis=0).max() == 0
     assert twin.step(controller.max_plausible[0])[1] != 4
+    twin.reset([0.0], [0.0])  # from estimates of that size rounding decides whether there is a plan
+    twin.step([0.1], [1.0])
     assert twin.step(controller.max_plausible[0] * 1.001)[1] == 4
     assert twin.step(None)[1] == 4
 

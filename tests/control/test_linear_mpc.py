@@ -233,5 +233,6 @@ def test_the_target_has_a_gradient(inputs):
     assert torch.autograd.gradcheck(lambda *point: tuple(mpc.target(*point)), point)
     out_of_reach = torch.tensor([90.0], dtype=torch.float64, requires_grad=True)
     mpc.target(out_of_reach).y.sum().backward()
+    assert out_of_reach.grad is not None
     assert out_of_reach.grad.abs().max() < 1e-9
     assert not mpc.target([1.0]).u.requires_grad

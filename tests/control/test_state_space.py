@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.signal
-import torch
 
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.mpc.identification import Identified
+from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.log import Log
-from torch_qpmpc.mpc.predictor import ARX
+from torch_qpmpc.mpc.subspace import Fit
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
 C, D = np.array([[1.0, 0.0]]), np.array([[0.0]])
@@ -60,28 +59,24 @@ def test_matrices_without_an_output_measure_the_state():
 
 def test_the_state_space_of_an_identification_has_its_predictions():
     rng = np.random.default_rng(0)
-    A, B, E, offset = (rng.normal(size=size) for size in ((2, 4), (2, 2), (2, 1), (2,)))
-    arx = ARX(*(torch.from_numpy(x) for x in (A, B, E, offset)))
+    shapes = {"A": (3, 3), "B": (3, 1), "E": (3, 1), "offset": (3,), "C": (2, 3), "L": (3, 2)}
+    parts = {name: rng.normal(size=shape) for name, shape in shapes.items()}
+    model = Innovations(**parts, S=np.eye(2), x0=np.zeros(3), P0=np.zeros((3, 3)))
     log = Log([], ("level", "flow"), ("pump",), ("rain",), dt=0.5)
-    plant = read_model(Identified(arx, Mock(), Mock(), log))
+    found = Identified(model, log, 1, Fit(model, 3, 2))
+    plant = read_model(found)
     assert (plant.outputs, plant.inputs, plant.known) == (log.outputs, log.inputs, log.known)
     assert plant.dt == 0.5
+    for name in ("A", "B", "E", "offset", "C"):
+        assert np.array_equal(getattr(plant, name), parts[name])
     with pytest.raises(QPError, match=r"^dt: got 1.0, expected the model's own 0.5. Leave dt out"):
-        read_model(Identified(arx, Mock(), Mock(), log), dt=1.0)
-    priced = read_model(Identified(arx, Mock(), Mock(), log), prices=["rain"])
-    assert not priced.E.any(), "a price acts on no plant"
-    more = read_model(Identified(arx, Mock(), Mock(), log), known=["price", "rain", "sun"])
+        read_model(found, dt=1.0)
+    assert not read_model(found, prices=["rain"]).E.any(), "a price acts on no plant"
+    more = read_model(found, known=["price", "rain", "sun"])
     assert np.array_equal(more.E, np.pad(plant.E, ((0, 0), (1, 1))))
     message = r"known: got \['price'\], expected all known .* rain. Pass known=\['rain', 'price'\]"
     with pytest.raises(QPError, match=message):
-        read_model(Identified(arx, Mock(), Mock(), log), known=["price"], prices=["price"])
-    y, u, d = [*rng.normal(size=(2, 2))], rng.normal(size=(6, 1)), rng.normal(size=(6, 1))
-    x = np.concatenate((y[1], A[:, 2:] @ y[0] + B[:, 1:] @ u[0]))
-    for k in range(1, 6):
-        lags = np.concatenate((y[k], y[k - 1])), np.concatenate((u[k], u[k - 1]))
-        y.append(A @ lags[0] + B @ lags[1] + E @ d[k] + offset)
-        x = plant.A @ x + plant.B @ u[k] + plant.E @ d[k] + plant.offset
-        assert np.allclose(plant.C @ x, y[-1])
+        read_model(found, known=["price"], prices=["price"])
 
 
 @pytest.mark.parametrize(

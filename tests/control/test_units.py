@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -20,7 +22,7 @@ def two_by_two(y, u, **options):
     y, u = np.array(y), np.array(u)
     B = np.array([[0.3, 0.1], [0.05, 0.2]]) * y[:, None] / u
     weights = {"Q": 1 / y**2, "dR": 0.1 / u**2, "y_slack": 1e3 / y}
-    bounds = {"u_bounds": (-3 * u, 3 * u), "y_bounds": (-5 * y, 5 * y)}
+    bounds: Any = {"u_bounds": (-3 * u, 3 * u), "y_bounds": (-5 * y, 5 * y)}
     model = np.diag([0.7, 0.8]), B
     return qm.Controller(qm.LinearMPC(model, 10, **{**weights, **bounds, **options}))
 
@@ -45,7 +47,7 @@ def test_a_set_point_in_any_unit_is_tracked_and_the_design_is_sound(y, u, bounde
 def test_an_input_in_watts_has_its_part_in_the_target(unit):
     A, B = np.array([[0.95, 0.0], [0.02, 0.9]]), np.array([[0.05, 0.0], [-0.01, 1e-6 * unit]])
     weights = {"Q": 1.0, "dR": [0.1, 0.1 * (1e-5 * unit) ** 2]}
-    bounds = {"u_bounds": ([-3.0, -3e5 / unit], [3.0, 3e5 / unit])}
+    bounds: Any = {"u_bounds": ([-3.0, -3e5 / unit], [3.0, 3e5 / unit])}
     target = qm.LinearMPC((A, B), 20, **weights, **bounds).target([0.5, 0.7])
     assert np.allclose(target.y, [0.5, 0.7])
     assert np.allclose(target.u.numpy() * [1.0, unit], [0.5, 65000.0], rtol=1e-6)

@@ -13,8 +13,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from tests.envs.test_kalman_filter import model
 from tests.store import Store
-from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, PastWindow, PlantEnv, PointMass
+from torch_qpmpc.envs import GrosZanonLTI, GymnasiumPlant, KalmanFilter, PlantEnv, PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop, plant_loop
 from torch_qpmpc.errors import QPError
 
@@ -90,20 +91,21 @@ def test_plant_loop_is_an_episode_of_the_environment():
     def policy(p: Tensor) -> Tensor:
         return (0.5 + p[:, :1] - p[:, 2:3] + p[:, -1:] - p[:, -2:-1] - p[:, -3:-2]).sigmoid()
 
-    plant, steps = Store(horizon=2, past=3), 6
-    env: Any = TransformedEnv(PlantEnv(plant, 4, steps, torch.float64, seed=0), PastWindow(3))
+    plant, steps = Store(horizon=2, observer=model(3, 2, 2)), 6
+    observer = KalmanFilter(model(3, 2, 2))
+    env: Any = TransformedEnv(PlantEnv(plant, 4, steps, torch.float64, seed=0), observer)
     actor: Any = TensorDictModule(
         lambda *known: policy(torch.cat(known, -1)), ["preview", "observation"], ["action"]
     )
     data = env.rollout(steps, actor)
     w = env.base_env._signals[data["episode"][:, 0, 0]]
-    recorded = Recorded(w, data["state"][:, 0], horizon=2, past=3)
+    recorded = Recorded(w, data["state"][:, 0], horizon=2, observer=plant.observer)
     run = plant_loop(policy, recorded, steps=steps, starts=4, gamma=0.9)
     seen = torch.cat((data["preview"], data["observation"]), -1)
     assert torch.equal(run.known[:-1], seen.transpose(0, 1))
     last = data["next"][:, -1]
     assert torch.equal(run.known[-1], torch.cat((last["preview"], last["observation"]), -1))
-    assert torch.equal(run.states, run.known[..., -1:])
+    assert torch.equal(run.states, run.known[..., -3:])
     assert torch.equal(run.actions, data["action"].transpose(0, 1))
     assert torch.equal(run.costs, -data["next", "reward"].squeeze(-1).T)
 
@@ -116,7 +118,7 @@ def test_the_seed_determines_signals_and_starts_of_plant_loop():
             self.begun = (plant, x, w)
 
         def __call__(self, p: Tensor) -> Tensor:
-            assert p.shape == (3, 8 + 3)
+            assert p.shape == (3, 8 + 2)
             return torch.full((3, 1), 2.0).double()
 
     plant, rival = Store(), Rival()
@@ -132,7 +134,6 @@ def test_the_seed_determines_signals_and_starts_of_plant_loop():
     for k in range(5):
         assert torch.equal(run.states[k], plant.output(x, w[:, k]))
         assert torch.equal(run.costs[k], plant.cost(x, one, w[:, k]))
-        assert torch.equal(run.known[k][:, 9], one[:, 0] if k else 0 * one[:, 0]), "u_{k-1}"
         x = plant.step(x, one, w[:, k])
 
 

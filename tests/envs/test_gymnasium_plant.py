@@ -236,12 +236,12 @@ class Fragile(Counter):
 
 
 @pytest.mark.filterwarnings("ignore:The plant ends an episode")
-@pytest.mark.parametrize(("past", "at"), [(1, 1), (1, 2), (1, 4), (3, 2), (3, 4)])
-def test_an_exception_ends_its_episode_alone(monkeypatch, past, at):
+@pytest.mark.parametrize("at", [1, 2, 4])
+def test_an_exception_ends_its_episode_alone(monkeypatch, at):
     monkeypatch.setitem(
         gymnasium.registry, "Fragile-v0", EnvSpec("Fragile-v0", lambda **x: Fragile(**x))
     )
-    plant = GymnasiumPlant("Fragile-v0", at=at).windowed(past)
+    plant = GymnasiumPlant("Fragile-v0", at=at)
     loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
     assert loop.raised is not None
     assert loop.raised.tolist() == [False, True] * 2
@@ -254,7 +254,7 @@ def test_an_exception_ends_its_episode_alone(monkeypatch, past, at):
     batch = env.rollout(12, break_when_any_done=False)
     env.close()
     bad = batch["next", "reward"].isnan()
-    assert bad.any() or at < past  # while it waits
+    assert bad.any()
     assert batch["next", "done"][bad].all()
     assert batch["next", "observation"].isfinite().all()
     assert len(plant.raised) > 2

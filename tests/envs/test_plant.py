@@ -6,19 +6,18 @@ from typing import Any
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
 
+from tests.envs.test_kalman_filter import model
 from tests.rollouts import Staggered, collected, network_policy
 from tests.store import Store
-from torch_qpmpc.envs import PastWindow, PlantEnv
+from torch_qpmpc.envs import PlantEnv
 from torch_qpmpc.errors import QPError
 
-PLANT = Store(horizon=3, past=3)
+PLANT = Store(horizon=3)
 
 
 def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: Any) -> Any:
-    env = PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed, **options)
-    return TransformedEnv(env, PastWindow(PLANT.past))
+    return PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed, **options)
 
 
 class StaggeredEnv(Staggered, PlantEnv):
@@ -27,10 +26,12 @@ class StaggeredEnv(Staggered, PlantEnv):
 
 def test_sizes_are_those_of_what_a_controller_sees():
     env = PLANT.vectorised(4, 6, seed=0)
-    assert env.observation_spec["observation"].shape == (4, 5)
+    assert env.observation_spec["observation"].shape == (4, 2)
     assert env.observation_spec["preview"].shape == (4, 8)
-    assert (PLANT.n_preview, PLANT.n_p) == (8, 13)
-    assert isinstance(Store(past=1).vectorised(4, 6, seed=0), PlantEnv)
+    assert (PLANT.n_preview, PLANT.n_p) == (8, 10)
+    observed = PLANT.observed(model(3, 2, 2))
+    assert observed.vectorised(4, 6, seed=0).observation_spec["observation"].shape == (4, 3)
+    assert (observed.n_x, observed.n_p, PLANT.n_x) == (3, 11, 2)
 
 
 def test_transitions_follow_the_plant():
@@ -41,9 +42,9 @@ def test_transitions_follow_the_plant():
     x = PLANT.starts(rng, 4)
     w = signals[torch.randint(5, (4,), generator=rng)]
     for k in range(6):
-        now, u = data[:, k], data[:, k]["action"]
+        now, u = data[:, k], PLANT.applied(data[:, k]["action"])
         assert torch.equal(now["state"], x)
-        assert torch.equal(now["observation"][:, -1:], PLANT.output(x, w[:, k]))
+        assert torch.equal(now["observation"], PLANT.output(x, w[:, k]))
         assert torch.equal(now["preview"], w[:, k : k + 4, :2].flatten(1))
         assert torch.equal(now["violation"], PLANT.violation(x, w[:, k]).unsqueeze(-1))
         assert torch.equal(now["next", "reward"], -PLANT.cost(x, u, w[:, k]).unsqueeze(-1))
@@ -68,7 +69,7 @@ def test_actions_are_clipped():
 
 def test_partial_resets_restart_exactly_the_finished_episodes():
     env = StaggeredEnv(PLANT, 6, 5, torch.float64, seed=2)
-    data = collected(TransformedEnv(env, PastWindow(PLANT.past)), batches=15, steps=2)
+    data = collected(env, batches=15, steps=2)
     done = data["next", "done"].squeeze(-1)
     assert done.any(0).all(), "every step ends some episode"
     assert not done.all(0).any(), "no step ends all"
@@ -76,8 +77,6 @@ def test_partial_resets_restart_exactly_the_finished_episodes():
     for key in ("observation", "preview", "state", "episode", "step_count", "violation"):
         assert torch.equal(now[key][~ended], then["next", key][~ended]), key
         assert not torch.equal(now[key][ended], then["next", key][ended]), key
-    fresh = now["observation"][ended]
-    assert torch.equal(fresh, fresh[:, -1:] * torch.tensor([1, 0, 1, 0, 1]))
     assert (now["step_count"][ended] == 0).all()
     assert (now["state"][ended][:, 1] == 0).all()
     assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
@@ -88,5 +87,5 @@ def test_bad_arguments_are_an_error():
         PlantEnv(PLANT, 1, 5, episodes=0)
     with pytest.raises(QPError, match="plant: got int, expected a Plant"):
         PlantEnv(3, 1, 5)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(QPError, match="past: got 0, expected a whole number >= 1"):
-        Store(past=0)
+    with pytest.raises(QPError, match="n_y: got 0, expected a whole number >= 1"):
+        Store(n_y=0)

@@ -11,14 +11,15 @@ import pytest
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
+from tests.envs.test_kalman_filter import model
 from tests.rollouts import network_policy
 from tests.store import Store
-from torch_qpmpc.envs import GrosZanonLTI, LinearSystemEnv, PastWindow, PlantEnv, PointMass
+from torch_qpmpc.envs import GrosZanonLTI, KalmanFilter, LinearSystemEnv, PlantEnv, PointMass
 from torch_qpmpc.errors import QPError
 
 
-def windowed(*arguments: Any, **options: Any) -> Any:
-    return TransformedEnv(PlantEnv(Store(past=3), *arguments, **options), PastWindow(3))
+def observed(*arguments: Any, **options: Any) -> Any:
+    return TransformedEnv(PlantEnv(Store(), *arguments, **options), KalmanFilter(model(3, 2, 2)))
 
 
 ENVS = {
@@ -26,8 +27,8 @@ ENVS = {
     "brownian": partial(LinearSystemEnv, PointMass("brownian")),
     "gros_zanon": partial(LinearSystemEnv, GrosZanonLTI()),
     "preview": partial(PlantEnv, Store()),
-    "no preview": partial(PlantEnv, Store(n_d=0, past=1)),
-    "window": windowed,
+    "no preview": partial(PlantEnv, Store(n_d=0)),
+    "estimate": observed,
 }
 
 

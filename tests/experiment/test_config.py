@@ -76,7 +76,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     for name, overrides in {
         "first": ("gate=true", "optimizer=adam"),
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton"),
-        "data": (*DATA, "+task.start_episodes=2", "+task.held=null", "+task.past=null"),
+        "data": (*DATA, "+task.start_episodes=2"),
     }.items():
         cfg = make_config(
             *SMALL, "updates=2", "task.eval_steps=2", "task.episode_steps=4", *overrides

@@ -122,7 +122,8 @@ def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
 # --- Runs that have finished ---------------------------------------------------------------------
 
 
-OUTCOME = {"seed": 1, "closed_gap": 0.5, "J_start": 2.0, "J_final": 1.5, "J_true_model": None}
+OUTCOME = {"seed": 1, "closed_gap": 0.5, "J_start": 2.0, "J_final": 1.5, "J_best": 1.5}
+OUTCOME |= {"J_true_model": None, "canonical_distance": None}
 
 
 @pytest.fixture

@@ -151,7 +151,6 @@ def test_the_true_scheme_has_the_mean_of_the_noise():
             ("task.id=MountainCarContinuous-v0",),
             r", expected task\.A of shape \(2, 2\), ",
         ),
-        (("+task.past=2",), r"^task.past: got 2 with a model that is given, expected 1"),
         (
             ("start=data", "task.stage_weight=[[1]]", "task.A=null", "task.B=null"),
             r"with task\.stage_weight of shape \(1, 1\), expected task\.stage_weight of shape ",
@@ -177,17 +176,16 @@ def test_a_model_on_the_command_line_is_that_of_the_qp():
     torch.testing.assert_close(bounded.ub[:3], torch.tensor([0.6, 0.07, 1]).double())
 
 
-# Plants with previews and windows
+# Plants with previews
 
 
 def test_a_scheme_passes_what_is_known_and_more(store_task):
     cfg = make_config("task=store", "task.horizon=4", "constraint=free")
     plant: Any = make_physics(cfg)
     mpc = make_mpc(cfg, plant)
-    assert (mpc.n_p, mpc.past, mpc.n_d, mpc.horizon) == (10 + 3, 2, 2, 4)
+    assert (mpc.n_p, mpc.n_x, mpc.n_d, mpc.horizon) == (10 + 2, 2, 2, 4)
     assert mpc.quadratic_program().w[0] == 2, "the scheme's own price, not task.state_slack"
-    assert len(mpc.G) == 4 * 2 + 1 + 4, "rates, too"
-    assert (mpc.C[0, :2].tolist(), mpc.C[0, 10:12].tolist()) == ([0, -1], [-0.5, 0.5])
+    assert (mpc.C[0, :2].tolist(), mpc.C[0, 10:12].tolist()) == ([0, -1], [1, 1])
     scheme = find_task(cfg.task).wrong_scheme(cfg, plant)
     for cost, message in (
         (dataclasses.replace(scheme.cost, c=7.0), None),

@@ -88,7 +88,7 @@ def test_a_preview_is_an_input_of_its_own():
     assert torch.equal(whole(p, a), operator(y, a, d))
     with pytest.raises(QPError, match=r"^preview: got .*, expected one with preview\."):
         operator(td.exclude("preview", ("next", "preview")))
-    with pytest.raises(QPError, match=r"s: got shape \(3, 4, 3\), expected shape \(\*batch, 11\)"):
+    with pytest.raises(QPError, match=r"s: got shape \(3, 4, 2\), expected shape \(\*batch, 10\)"):
         whole(td)
 
 

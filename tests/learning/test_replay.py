@@ -137,14 +137,14 @@ def test_tau_begins_with_all_that_is_known():
     data = store.collect(4, 30, dtype=torch.float32)
     done = data["next", "done"].squeeze(-1)
     data["collector", "traj_ids"] = done.cumsum(1) - done.long() + 100 * torch.arange(4)[:, None]
-    replay = Replay(4 * 30, 4, 8, 3, 50, n_x=1, preview_key="preview")
+    replay = Replay(4 * 30, 4, 8, 3, 50, n_x=2, preview_key="preview")
     replay.extend(data)
     tau = replay.sample_tau()
     assert tau.shape == (50, store.make_mpc().n_z)
 
     def windows(i: int, k: int) -> torch.Tensor:
         p = [data["preview"][i, k], data["observation"][i, k]]
-        a, y = data["action"][i, k : k + 3], data["next", "observation"][i, k : k + 3, -1:]
+        a, y = data["action"][i, k : k + 3], data["next", "observation"][i, k : k + 3]
         return torch.cat([*p, torch.cat((a, y), -1).flatten()])
 
     inside = [(i, k) for i in range(4) for k in range(28) if not done[i, k : k + 2].any()]

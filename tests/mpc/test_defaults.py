@@ -104,12 +104,12 @@ def rewarded() -> tuple[TensorDict, torch.Tensor]:
 @pytest.mark.parametrize("hessian", ["diagonal", "block"])
 def test_from_data_fits_the_cost_to_the_rewards(hessian):
     log, weight = rewarded()
-    mpc = QPMPC.from_data(log, 3, past=2, hessian=hessian, gamma=0.8, learn=("H", "H_f", "q"))
+    mpc = QPMPC.from_data(log, 3, hessian=hessian, gamma=0.8, learn=("H", "H_f", "q"))
     H, H_f = (x if hessian == "diagonal" else x.diagonal() for x in (mpc.H, mpc.H_f))
     assert_close(H.detach(), weight, rtol=1e-6, atol=1e-6)
     assert_close(H_f.detach(), weight[:2], rtol=1e-6, atol=1e-6)
     assert_close(mpc.q[-2:].detach(), torch.tensor([1.0, 0.0]).double(), rtol=1e-6, atol=1e-6)
-    own = QPMPC.from_data(log, 3, past=2, stage_weight=[1.0, 1.0, 0.1])
+    own = QPMPC.from_data(log, 3, stage_weight=[1.0, 1.0, 0.1])
     assert own.H.tolist() == [1.0, 1.0, 0.1]
     assert (own.q == 0).all()
 
@@ -117,11 +117,11 @@ def test_from_data_fits_the_cost_to_the_rewards(hessian):
 def test_from_data_refuses_a_log_without_rewards():
     message = r"^stage_weight: got none, and a log without rewards, expected a weight, or finite"
     with pytest.raises(QPError, match=message):
-        QPMPC.from_data(arx_log(), 3, past=2)
+        QPMPC.from_data(arx_log(), 3)
     log, _ = rewarded()
     log["next", "reward"][0, 3] = torch.nan
     with pytest.raises(QPError, match=r"^stage_weight: got none, and a log with rewards of NaN"):
-        QPMPC.from_data(log, 3, past=2)
+        QPMPC.from_data(log, 3)
 
 
 def test_a_random_start_warns_once_when_its_policy_acts():

@@ -1,119 +1,108 @@
+"""Models identified from logs, and QPs that start from them."""
+
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
-from tests.logs import A, B, E, arx_log
+from tests.logs import arx_log, room
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.mpc.banded import banded_matrix
-from torch_qpmpc.mpc.log import as_log
-from torch_qpmpc.mpc.predictor import outputs_in, predict, windows
 
 N = 6
-PAST: Any = {"past": 2, "n_d": 1}
 COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
+
+
+def lag_log(noise: float = 0.0, steps: int = 120) -> TensorDict:
+    """Return a log of two outputs that are the state."""
+    draw = torch.Generator().manual_seed(0)
+    A, B = torch.tensor([[0.9, 0.2], [-0.1, 0.7]]).double(), torch.tensor([[0.5], [1.0]]).double()
+    u, e = (torch.randn(steps, n, generator=draw, dtype=torch.float64) for n in (1, 2))
+    y = [torch.zeros(2, dtype=torch.float64)]
+    for k in range(steps):
+        y.append(A @ y[-1] + B @ u[k] + 0.3 + noise * e[k])
+    y = torch.stack(y)
+    reward = -y[:-1].square().sum(-1, keepdim=True) - 0.1 * u.square()
+    following = {"observation": y[1:], "reward": reward}
+    return TensorDict({"observation": y[:-1], "action": u, "next": following}, [steps])
 
 
 # QPMPC.from_data
 
 
 @pytest.mark.parametrize("structure", ["free", "varying", "tied"])
-def test_without_noise_all_starts_predict_the_plant(structure):
-    mpc = QPMPC.from_data(arx_log(), N, structure=structure, **PAST, **COST)
-    assert (mpc.n_x, mpc.n_u, mpc.horizon, mpc.past, mpc.n_d) == (2, 1, N, 2, 1)
+def test_a_qp_starts_from_the_model_of_the_outputs(structure):
+    mpc = QPMPC.from_data(lag_log(), N, structure=structure, **COST)
+    assert (mpc.n_x, mpc.n_u, mpc.horizon, mpc.n_d) == (2, 1, N, 0)
     assert mpc.structure == structure
-    z = windows(as_log(arx_log(seed=1), n_d=1).trajectories, mpc.layout).z[:5]
-    plan = mpc.solve(z[:, : mpc.n_p], z[:, mpc.n_p : mpc.n_p + 1]).z
-    true = banded_matrix(A, B, N, E)
-    offset = -torch.tensor([0.1, -0.3]).double().repeat(N)
-    assert_close(plan @ true.mT, offset.expand(5, -1), rtol=1e-8, atol=1e-8)
+    assert torch.equal(mpc.C, mpc.C_0)
+    s = torch.tensor([[1.0, -2.0]]).double()
+    x, u = (part[0] for part in mpc.predicted(mpc.solve(s).z))
+    A, B = torch.tensor([[0.9, 0.2], [-0.1, 0.7]]).double(), torch.tensor([[0.5], [1.0]]).double()
+    assert_close(x[1:], x[:-1] @ A.mT + u @ B.mT + 0.3, rtol=1e-7, atol=1e-7)
 
 
-def test_C_0_is_the_band_of_the_model():
-    log = arx_log(noise=0.2)
-    free, tied = (
-        QPMPC.from_data(log, N, structure=structure, **PAST, **COST)
-        for structure in ("free", "tied")
-    )
-    assert torch.equal(free.C_0, tied.C_0)
-    assert torch.equal(tied.C, tied.C_0)
-    assert not torch.equal(free.C, free.C_0)
-    assert torch.equal(tied.model()[0], qm.identify(log, N, **PAST).model.A)
+def test_a_missing_stage_weight_is_fitted_to_the_rewards():
+    mpc = QPMPC.from_data(lag_log(), N, learn=(), solver="daqp")
+    weight = torch.tensor([2.0, 2.0, 0.2]).double()
+    assert_close(mpc.quadratic_program().H[:3, :3], torch.diag(weight), rtol=1e-6, atol=1e-6)
 
 
-def test_a_ridge_of_a_users_own():
-    weak, strong = (
-        qm.identify(arx_log(noise=0.2), N, ridge=ridge, **PAST).model.A for ridge in (1e-9, 10.0)
-    )
-    assert strong.norm() < 0.3 * weak.norm()
+def test_a_qp_of_an_identification_acts_on_its_states():
+    found = qm.identify(arx_log(noise=0.2, steps=200), N, n_d=1, order=5)
+    n = len(found.model.A)
+    mpc = QPMPC.of(**found.arguments, stage_weight=[1.0] * n + [0.1], structure="tied")
+    assert (mpc.n_x, mpc.n_d) == (n, 1)
+    for part, matrix in zip(mpc.model(), found.model[:2], strict=False):
+        assert_close(part, torch.tensor(matrix))
 
 
 # The report
 
 
-def test_errors_are_those_of_data_that_the_fit_has_not_seen():
-    log = arx_log(noise=0.2, episodes=2, steps=300)
-    found = qm.identify(log, N, **PAST)
-    assert found.errors.shape[1:] == (N, 2)
-    fresh = as_log(arx_log(seed=5, noise=0.2, episodes=4, steps=400), n_d=1).trajectories
-    Z, ahead = windows(fresh, found.options.layout)
-    Z = Z[ahead >= N]
-    error = Z[:, outputs_in(found.options.layout)] - predict(
-        found.constraints, Z, found.options.layout
-    )
-    assert_close(found.rmse, error.square().mean(0).sqrt(), rtol=0.15, atol=0)
-    assert_close(found.covariance, 0.04 * torch.eye(2).double(), rtol=0, atol=0.02)
-    assert (found.rmse.diff(dim=0) > 0).all()
-    assert ((found.R2 > 0.5) & (found.R2 < 1)).all()
-
-
 def test_the_report_is_printed():
-    text = str(qm.identify(arx_log(noise=0.2), N, **PAST))
-    signals, first, head, *rows = text.splitlines()
-    assert signals == "120 steps: outputs y1, y2; inputs u1; known d1"
-    assert first.startswith("free C from 120 transitions in 3 trajectories, n_x=2, n_u=1, horizo")
+    text = str(qm.identify(lag_log(noise=0.2), N))
+    signals, order, white, head, *rows = text.splitlines()
+    assert signals == "120 steps: outputs y1, y2; inputs u1; known "[: len(signals)]
+    assert order.startswith("Model of order 2 with poles of sizes 0.8")
+    assert white.startswith("Autocorrelations of the residuals in their 95 % bound: ")
     assert head.split() == ["steps", "RMSE", "of", "y1,", "y2", "R2,", "cross-validated"]
     assert [int(row.split()[0]) for row in rows] == [1, 2, 5, 6]
     assert all(len(row.split()) == 5 for row in rows)
 
 
-def test_errors_are_nan_where_no_part_of_the_data_is_long_enough():
-    found = qm.identify(arx_log(noise=0.2, episodes=1, steps=30), 20, past=2)
-    assert found.rmse.isfinite().all(1).nonzero().flatten().tolist() == list(range(14))
-    assert str(found).endswith("nan nan")
-    assert qm.identify(arx_log(episodes=1, steps=10), 3, **PAST).rmse.isnan().all()
+def test_errors_are_those_of_data_that_the_fit_has_not_seen():
+    found = qm.identify(lag_log(noise=0.2, steps=600), N)
+    assert found.errors.shape[1:] == (N, 2)
+    assert_close(found.rmse[0], torch.full((2,), 0.2).double(), rtol=0.15, atol=0)
+    assert_close(torch.tensor(found.model.S), 0.04 * torch.eye(2).double(), rtol=0, atol=0.01)
+    assert ((found.R2 > 0.5) & (found.R2 < 1)).all()
 
 
-@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
-def test_a_held_output_keeps_its_value_and_others_depend_on_it(structure):
-    log = arx_log(noise=0.2)
-    held = qm.identify(log, N, structure=structure, held=[1], **PAST)
-    sizes = held.options.layout
-    z = windows(as_log(log, n_d=1).trajectories, sizes).z[:5]
-    planned = predict(held.constraints, z, sizes)
-    assert_close(planned[..., 1], z[:, sizes.n_p - 1 : sizes.n_p].expand(-1, N))
-    assert held.model.A[0, 1].abs() > 0.1
-    mpc = QPMPC.from_data(log, N, structure=structure, held=[1], **PAST, **COST)
-    assert_close(mpc.C_0[1], held.constraints.C[1])
-    free = qm.identify(log, N, structure=structure, **PAST)
-    assert_close(held.model.A[0], free.model.A[0])
-    assert held.rmse[-1, 0] < 2 * free.rmse[-1, 0]
-
-
-@pytest.mark.parametrize("structure", ["free", "varying", "tied"])
-def test_a_collinear_output_leaves_the_predictions_as_good(structure):
-    log = arx_log(noise=0.2)
+def test_a_collinear_output_leaves_the_predictions_as_good():
+    log = lag_log(noise=0.2, steps=300)
     twice: Any = log.clone()
     for steps in (twice, twice["next"]):
         y = steps["observation"]
         steps["observation"] = torch.cat((y, 3 * y[..., :1] - y[..., 1:]), -1)
-    one, both = (qm.identify(x, N, structure=structure, **PAST) for x in (log, twice))
+    one, both = (qm.identify(x, N) for x in (log, twice))
     assert_close(both.rmse[:, :2], one.rmse, rtol=0.1, atol=0)
+
+
+def test_a_simulation_is_the_plant_without_corrections():
+    log = qm.read_log(room(), outputs=["T"], inputs=["q"], known=["T_out"])
+    found, (y, u, d) = qm.identify(log, 4), log.trajectories[0]
+    assert_close(found.simulate(u, y[:1], d), y)
+    assert_close(found.simulate(u[:1], y[:2], d[:1]), y[:2])
+    assert 0 < (found.simulate(u, y[:1] + 1, d) - y)[-1].abs() < 0.01, "it forgets its start"
+    for name, wrong in {"u": (u[:, :0], y[:1], d), "y": (u, y[0], d), "d": (u, y[:1])}.items():
+        with pytest.raises(QPError, match=rf"^{name}: got shape \(.*\), expected \("):
+            found.simulate(*wrong)
 
 
 # Bad data
@@ -138,13 +127,8 @@ def discrete_actions(log: TensorDict) -> TensorDict:
     ("call", "message"),
     [
         (
-            lambda: qm.identify(arx_log(episodes=2, steps=4), N, **PAST),
-            "trajectories: got 8 transitions in 2 trajectories, 6 of them with 1 before them, "
-            "expected at least 9 such for past=2, n_x=2, n_u=1 and n_d=1. A fit of as many tran",
-        ),
-        (
-            lambda: qm.identify(arx_log(episodes=1, steps=4), N),
-            "trajectories: got 4 transitions in 1 trajectories, expected at least 5 such .* Log mo",
+            lambda: qm.identify(lag_log(steps=4), N),
+            "trajectories: got 4 transitions in 1 trajectories, expected at least 5 for .* Log mo",
         ),
         (
             lambda: qm.identify(frozen_action(arx_log()), N),
@@ -159,14 +143,10 @@ def discrete_actions(log: TensorDict) -> TensorDict:
             "action: got one-hot vectors of discrete ones, expected continuous actions",
         ),
         (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
+        (lambda: qm.identify(arx_log(), order=-1), "order: got -1, expected a whole number >= 0"),
         (
             lambda: qm.identify(arx_log(), N, n_x=3),
             r"observation: got shape \(3, 40, 2\), expected",
-        ),
-        (lambda: qm.identify(arx_log(), N, ridge=-1.0), "ridge: got -1.0, expected a finite numbe"),
-        (
-            lambda: qm.identify(arx_log(), N, held=[2]),
-            r"held: got \[2\], expected a list of indices of the 2 outputs, from 0 on. In train.py",
         ),
         (lambda: QPMPC.of(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
     ],
@@ -174,3 +154,9 @@ def discrete_actions(log: TensorDict) -> TensorDict:
 def test_a_mistake_is_named(call, message):
     with pytest.raises(QPError, match=f"^{message}"):
         call()
+
+
+def test_matrices_are_of_numpy_and_can_be_read():
+    model = qm.identify(lag_log()).model
+    np.testing.assert_allclose(model.A, [[0.9, 0.2], [-0.1, 0.7]], atol=1e-8)
+    np.testing.assert_allclose(np.abs(model.poles), np.abs(np.linalg.eigvals(model.A)), atol=1e-9)

@@ -78,7 +78,7 @@ def test_arrays_and_columns_have_names_by_default():
 def test_steps_of_torchrl_get_names():
     log = qm.read_log(arx_log(), ["T", "p"], ["q"], ["w"])
     assert str(log) == "120 steps: outputs T, p; inputs q; known w"
-    assert qm.identify(log, 4, past=2).log is log
+    assert qm.identify(log, 4).log is log
     with pytest.raises(QPError, match=r"^inputs: got \['q', 'v'\], expected 1 names"):
         qm.read_log(arx_log(), ["T", "p"], ["q", "v"])
     with pytest.raises(QPError, match=r"^time, episode: got 't' and None, expected None for a"):
@@ -134,7 +134,7 @@ def test_a_signal_may_have_any_name(names):
     y, u = rng.normal(size=(30, 2)), rng.normal(size=30)
     log = qm.read_log({names[0]: y[:, 0], names[1]: y[:, 1], "u": u, "t": u}, names, ["u"])
     assert (log.outputs, log.inputs, log.known) == (tuple(names), ("u",), ())
-    assert qm.LinearMPC(qm.identify(log, 2, structure="tied"), 3, Q=1.0).horizon == 3
+    assert qm.LinearMPC(qm.identify(log, 2), 3, Q=1.0).horizon == 3
     assert qm.read_log({"y": u, "u": u**2, "d": np.arange(30)}, time="d").known == ()
 
 
@@ -346,8 +346,8 @@ def test_plain_data_are_identified_and_start_a_qp():
     frame = room()
     plain = frame.rename(columns={"T": "y", "q": "u", "T_out": "d"})
     found = qm.identify(plain, 4)
-    assert_close(found.model.A, torch.tensor([[0.9]]).double())
-    assert_close(found.model.E, torch.tensor([[0.1]]).double())
+    assert_close(found.model.A, np.array([[0.9]]))
+    assert_close(found.model.E, np.array([[0.1]]))
     mpc = qm.QPMPC.from_data([plain, plain], 4, stage_weight=[1.0, 0.1])
     assert mpc.n_d == 1
     log = qm.read_log(frame, **NAMES)
@@ -360,18 +360,6 @@ def test_plain_data_are_identified_and_start_a_qp():
         qm.identify(log, 4, n_d=2)
     with pytest.raises(QPError, match=r"^n_x: got 2, but 1 of T, expected the log's own"):
         qm.identify(log, 4, n_x=2)
-
-
-def test_a_simulation_is_the_plant_without_corrections():
-    log = qm.read_log(room(), **NAMES)
-    found, (y, u, d) = qm.identify(log, 4, past=2), log.trajectories[0]
-    assert_close(found.simulate(u, y[:2], d), y)
-    assert_close(found.simulate(u[:1], y[:2], d[:1]), y[:2])
-    off = found.simulate(u, y[:2] + 1, d)
-    assert 0 < (off - y)[-1].abs() < 0.01, "it forgets its start"
-    for name, wrong in {"u": (u[:, :0], y[:2], d), "y": (u, y[:1], d), "d": (u, y[:2])}.items():
-        with pytest.raises(QPError, match=rf"^{name}: got shape \(.*\), expected \("):
-            found.simulate(*wrong)
 
 
 # Steps of TorchRL

@@ -136,21 +136,6 @@ def test_a_poor_fit_has_a_low_R2(cost):
     assert not fit_stage_cost(arguments()[: len(cost)], cost).R2 > 0.9
 
 
-@pytest.mark.parametrize("convex", [True, False])
-def test_entries_apart_have_no_cross_terms(convex):
-    v, n = arguments(), arguments().shape[1]
-    sign = torch.ones(n).double()
-    sign[0] = 1.0 if convex else -1.0
-    cost = (sign * v.square()).sum(1) + v[:, 0] * v[:, 1] + v[:, -1]
-    found = fit_stage_cost(v, cost, n_apart=1)
-    assert (found.W[-1, :-1] == 0).all()
-    assert (found.W[:-1, -1] == 0).all()
-    assert torch.linalg.eigvalsh(found.W)[0] > -1e-9
-    assert (found.R2 > 1 - 1e-9) is convex
-    with_cross_terms = cost + v[:, 0] * v[:, -1]
-    assert fit_stage_cost(v, with_cross_terms, n_apart=1).R2 < 1 - 1e-5
-
-
 @pytest.mark.parametrize(
     ("v", "cost", "message"),
     [

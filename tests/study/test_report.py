@@ -57,12 +57,12 @@ def test_the_command_writes_every_table_and_figure(study, tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("store_task")
-def test_a_report_of_runs_with_a_window_and_previews(tmp_path):
+def test_a_report_of_runs_with_previews(tmp_path):
     settings = ("task=store", "constraint=free", "task.eval_steps=5")
     train.train(make_config(*SMALL, *settings), str(tmp_path / "free"), quiet=True)
     frame = collect(tmp_path)
     start = frame["run"].iloc[0].start
-    assert (start.past, start.n_d) == (2, 2)
+    assert (start.n_x, start.n_d) == (2, 2)
     assert frame["zeros_above"].item() < 1
     assert "nan to nan (0 of 1)" in report.write(frame, tmp_path / "report")
     drawn = {path.name for path in (tmp_path / "report" / tmp_path.name).iterdir()}

@@ -41,11 +41,12 @@ class Controller:
     Args:
         mpc: the MPC. Call `reset` when its theta has changed.
         noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
-            default a tenth of half the distance of the outputs' bounds, or without bounds of the
-            deviation that costs one, ``1 / sqrt(Q)``.
-        drift: standard deviations of the change of each disturbance in a step; by default a tenth
-            of half the distance of the bounds of the output or the input. A larger ratio of drift
-            to noise rejects disturbances faster and passes on more noise.
+            default those of the identification. Without one, a tenth of half the distance of the
+            outputs' bounds, or without bounds of the deviation that costs one, ``1 / sqrt(Q)``.
+        drift: standard deviations of the change of each disturbance in a step; by default the
+            identified noise. Without one, a tenth of half the distance of the bounds of the output
+            or the input. A larger ratio of drift to noise rejects disturbances faster and passes on
+            more noise.
         window: True replaces the filter by estimates from the last few outputs and inputs alone, as
             in an identification: the fastest, and the noisiest. Call `reset` with y and u of the
             plant at rest, or the first steps' estimates are wild.

@@ -13,7 +13,15 @@ from torch import Tensor
 
 from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.observer import ABSURD, SMALL, Observer, kalman, max_plausible, windowed
+from torch_qpmpc.control.observer import (
+    ABSURD,
+    SMALL,
+    Observer,
+    floored,
+    kalman,
+    max_plausible,
+    windowed,
+)
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.program import QuadraticProgram, Status
@@ -105,8 +113,13 @@ class Law:
             QPError: a deviation is invalid, or the model has no filter.
         """
         design, w = mpc.design, mpc.design.disturbances
-        noise = _deviations("noise", noise, SMALL * design.usual, design.plant.outputs)
-        drift = _deviations("drift", drift, SMALL * design.of_w(design.usual), w.names)
+        share, drifts = np.full(len(design.usual), SMALL), np.full(len(w.names), SMALL)
+        if design.plant.noise is not None:
+            share = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual))) / design.usual
+            of_outputs = share @ np.abs(w.C)
+            drifts = np.where(of_outputs > 0, of_outputs, share.max(initial=0.0))
+        noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)
+        drift = _deviations("drift", drift, drifts * design.of_w(design.usual), w.names)
         observer = kalman(design, noise, drift)
         largest = max_plausible(design, noise)
         if window:

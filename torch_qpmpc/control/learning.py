@@ -149,7 +149,7 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
     y, d = (torch.cat(part).numpy() for part in list(zip(*held_out.trajectories, strict=True))[::2])
     middle = np.clip(y.mean(0) if middle is None else middle, *design.y_bounds)
     size = _sizes(design, spread, y.std(0))
-    noise = identified.covariance.diagonal().sqrt().nan_to_num().numpy()
+    noise = np.sqrt(np.diag(identified.model.S))
 
     model = _state_space(identified, design)
     n, m, n_y, _ = model.sizes
@@ -218,14 +218,13 @@ def _parts(log: Log, plant: StateSpace) -> tuple[Log, Log]:
 
 
 def _identified(log: Log, plant: StateSpace) -> Identified:
-    """Fit an ARX model of as many lags as the state has outputs."""
+    """Fit a model of as many states as the controller's."""
     d = torch.cat([trajectory.d for trajectory in log.trajectories])
     for name, column, acts in zip(plant.known, d.mT, np.any(plant.E, axis=0), strict=True):
         if acts and column.std() <= STILL * column.abs().max():
             remedy = "Its effect cannot be learned: pass rows in which it varies."
             raise QPError.expected("known", f"a constant {name}", "one that varies", remedy)
-    n, _, n_y, _ = plant.sizes
-    return identify(log, 1, past=-(-n // n_y), structure="tied")
+    return identify(log, 1, order=len(plant.A))
 
 
 def _state_space(model: Identified, design: Design) -> StateSpace:

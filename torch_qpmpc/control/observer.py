@@ -16,6 +16,8 @@ from torch_qpmpc.errors import QPError
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1
+#: The noise of an identified output, relative to its usual deviation, at least.
+LEAST = 1e-3
 #: A filter's mode this near to the unit circle counts as on it.
 ON_CIRCLE = 1e-9
 #: A smaller singular value, relative to the largest, determines no estimate at rest.
@@ -55,8 +57,9 @@ class Observer(NamedTuple):
 def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     """Return the steady-state Kalman filter of a design's model.
 
-    White noise acts on each input, with `SMALL` times its half range as standard deviation, on each
-    output, and on the change of each disturbance in a step.
+    The noise of the state and the outputs is that of an identification. Without one, white noise
+    acts on each input, with `SMALL` times its half range as standard deviation, and on each output.
+    White noise acts on the change of each disturbance in a step.
 
     Args:
         design: the design.
@@ -74,11 +77,17 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     check_observable(plant)
     F = np.block([[plant.A, w.B], [np.zeros((n_w, n)), np.eye(n_w)]])
     H = np.hstack((plant.C, w.C))
-    inputs = SMALL**2 * plant.B
-    process = block_diag(inputs @ inputs.T, np.diag(drift**2))
+    V, process, G = np.diag(noise**2), SMALL**4 * plant.B @ plant.B.T, np.zeros((n + n_w, n_y))
+    if plant.noise is not None:  # x+ = A x + B u + G e and y = H [x; w] + e before its correction
+        S = floored(plant.noise[1], design.usual / of_y)
+        size = noise / np.sqrt(np.diag(S))
+        V = size[:, None] * S * size
+        G[:n] = plant.noise[0] / size
+        process = (F @ G @ V @ G.T @ F.T)[:n, :n]
     try:
-        P = scipy.linalg.solve_discrete_are(F.T, H.T, process, np.diag(noise**2))
-        L = np.linalg.solve(H @ P @ H.T + np.diag(noise**2), H @ P).T
+        process = block_diag(process, np.diag(drift**2))
+        P = scipy.linalg.solve_discrete_are(F.T, H.T, process, V, s=F @ G @ V)
+        L = np.linalg.solve(H @ P @ H.T + V, H @ P + V @ G.T).T
         stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1 - ON_CIRCLE
     except (ValueError, np.linalg.LinAlgError):
         L, stable = np.zeros((n + n_w, n_y)), False
@@ -97,6 +106,11 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         of_e[:, None] * L / of_y,
         of_e[:, None] * rest / np.concatenate((of_e, of_y)),
     )
+
+
+def floored(S: Array, usual: Array) -> Array:
+    """Return a covariance of outputs with `LEAST` of their usual deviations at least."""
+    return S + np.diag((LEAST * usual) ** 2)
 
 
 def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:

@@ -73,7 +73,11 @@ class Scaling(NamedTuple):
             plant.E * (d / x[:, None]),
             plant.offset / x,
         )
-        return StateSpace(*matrices, None, plant.inputs, plant.outputs, plant.known)
+        noise = plant.noise
+        if noise is not None:
+            noise = noise[0] * (y / x[:, None]), noise[1] / y / y[:, None]
+        names = plant.inputs, plant.outputs, plant.known
+        return StateSpace(*matrices, None, *names, noise=noise)
 
 
 def ranges(bounds: Bounds) -> Array:

@@ -31,6 +31,7 @@ class StateSpace:
         dt: the sampling time, or None.
         inputs, outputs, known: names of the entries of u, y and d.
         units: units by name, where known.
+        noise: L ``(n, n_y)`` and S ``(n_y, n_y)`` of an identification, see `Innovations`.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -46,6 +47,7 @@ class StateSpace:
     outputs: tuple[str, ...]
     known: tuple[str, ...]
     units: Mapping[str, str] = field(default_factory=dict)
+    noise: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -112,9 +114,10 @@ def read_model(
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
     if isinstance(model, StateSpace):
         return model
-    offset, units = None, {}
+    offset, units, noise = None, {}, None
     if isinstance(model, Identified):
-        A, B, C, E, offset = _of_arx(model)
+        A, B, E, offset, C, L, S, *_ = model.model
+        noise = L, S
         log, dt = model.log, _own_dt(dt, model.log.dt)
         units = dict(log.units)
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
@@ -143,7 +146,7 @@ def read_model(
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
-    return StateSpace(A, B, C, E, offset, dt, *names, units)
+    return StateSpace(A, B, C, E, offset, dt, *names, units, noise)
 
 
 def read_row(name: str, value: Any, names: Sequence[str]) -> Array:
@@ -268,20 +271,3 @@ def _own_dt(dt: float | None, own: float | None) -> float | None:
         remedy = "Leave dt out, or sample the model again."
         raise QPError.expected("dt", repr(dt), f"the model's own {own:g}", remedy)
     return own
-
-
-def _of_arx(identified: Identified) -> tuple[Array, Array, Array, Array, Array]:
-    """Return A, B, C, E and the offset of an ARX model in observer form, with states of outputs.
-
-    The first block of the state is y, and block i what the lags i, .., L of the past add to y.
-    """
-    A_lags, B_lags, E, offset = (np.asarray(x.detach()) for x in identified.model)
-    n_y = len(A_lags)
-    lags = A_lags.shape[1] // n_y
-    first = np.concatenate(np.split(A_lags, lags, axis=1))
-    A = np.eye(n_y * lags, k=n_y)
-    A[:, :n_y] = first
-    B = np.concatenate(np.split(B_lags, lags, axis=1))
-    below = np.zeros((n_y * (lags - 1), E.shape[1]))
-    C = np.eye(n_y, n_y * lags)
-    return A, B, C, np.vstack((E, below)), np.concatenate((offset, np.zeros(len(below))))

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_seed, check_tensor, check_whole
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
+from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import LinearSystem
-from torch_qpmpc.envs.past_window import first_window, next_window
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.loops import Step, run_loop
@@ -29,7 +29,7 @@ class ClosedLoop:
         actions: ``(steps, starts, n_u)``, as applied: clipped to their bounds.
         costs: ``(steps, starts)``, L(s_k, a_k).
         gamma: the discount factor of ``J_discounted``.
-        n_y: the last n_y entries of p are the state or, of a `Plant`, the output; None for all.
+        n_x: the last n_x entries of p are the state, or what the policy sees of it; None for all.
         lengths: the numbers of steps of the episodes, ``(starts,)``; None if none ends early.
         raised: True for the episodes that an exception of the plant ended, ``(starts,)``: J leaves
             them out.
@@ -39,14 +39,14 @@ class ClosedLoop:
     actions: Tensor
     costs: Tensor
     gamma: float
-    n_y: int | None = None
+    n_x: int | None = None
     lengths: Tensor | None = None
     raised: Tensor | None = None
 
     @property
     def states(self) -> Tensor:
-        """The states ``(steps + 1, starts, n_x)``, or the outputs of a `Plant`."""
-        return self.known[..., -(self.n_y or 0) :]
+        """The states ``(steps + 1, starts, n_x)``, or the outputs or estimates of a `Plant`."""
+        return self.known[..., -(self.n_x or 0) :]
 
     @property
     def J(self) -> float:
@@ -130,9 +130,9 @@ def plant_loop(
 
     Args:
         policy: maps p ``(starts, n_p)`` in float64, the known signals d_k, .., d_{k+N} and the
-            window of past outputs and applied actions, to actions ``(starts, n_u)``. If it has a
-            method ``begin(plant, x, w)``, that is called first, with the true start states x and
-            all signals w, for rivals that see them and filters that need a reset.
+            output or the estimate of the state, to actions ``(starts, n_u)``. If it has a method
+            ``begin(plant, x, w)``, that is called first, with the true start states x and all
+            signals w, for rivals that see them and filters that need a reset.
         plant: the plant.
         steps, starts, seed, gamma: as in `closed_loop`.
 
@@ -146,23 +146,24 @@ def plant_loop(
     x = plant.starts(rng, starts)
     if (begin := getattr(policy, "begin", None)) is not None:
         begin(plant, x, w)
-    zero = torch.zeros_like(plant.lb_a)  # bounds may be infinite
-    k, window = 0, first_window(plant.output(x, w[:, 0]), plant.past, zero)
+    observer = None if plant.observer is None else KalmanFilter(plant.observer)
+    k, y = 0, plant.output(x, w[:, 0])
+    seen = y if observer is None else observer.first(y)
 
     def known() -> Tensor:
         ahead = w[:, k : k + plant.horizon + 1, : plant.n_d]
-        return torch.cat((ahead.flatten(1), window), -1)
+        return torch.cat((ahead.flatten(1), seen), -1)
 
     def step(a: Tensor) -> Step:
-        nonlocal k, x, window
+        nonlocal k, x, seen
         u = plant.applied(a)
         cost = plant.cost(x, u, w[:, k])
         x = plant.step(x, u, w[:, k])
-        k += 1
-        window = next_window(window, u, plant.output(x, w[:, k]))
+        k, d, y = k + 1, w[:, k, : plant.n_d], plant.output(x, w[:, k + 1])
+        seen = y if observer is None else observer.following(seen, u, d, y, k)
         return Step(known(), u, cost)
 
-    return _run(policy, known(), step, steps, (starts, plant.n_u), gamma, plant.n_y)
+    return _run(policy, known(), step, steps, (starts, plant.n_u), gamma, plant.n_x)
 
 
 @torch.no_grad()
@@ -177,8 +178,7 @@ def gymnasium_loop(
 ) -> ClosedLoop:
     """Run ``policy`` as `closed_loop` does, in a Gymnasium environment; start i has seed + i.
 
-    After an episode's end its state stays constant, at no cost. With a window the cost of the steps
-    that fill it is in that of the first step, without discounts. ``steps`` is by default the length
+    After an episode's end its state stays constant, at no cost. ``steps`` is by default the length
     of the environment's own episodes. The policy is not called once all episodes have ended.
 
     Raises:
@@ -188,26 +188,29 @@ def gymnasium_loop(
     steps = plant.max_steps if steps is None else steps
     _check(policy, steps, starts, seed, gamma)
     envs = [plant.make(steps) for _ in range(starts)]
-    s = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
-    waited = np.zeros(starts)
-    if plant.past > 1:
-        waited = np.array([env.get_wrapper_attr("waited") for env in envs])
-    over, lengths = np.zeros(starts, dtype=bool), np.zeros(starts)
-    raised = np.isnan(waited) & bool(plant.raised)
+    y = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(envs)])
+    observer = None if plant.observer is None else KalmanFilter(plant.observer)
+    s = _float64(y) if observer is None else observer.first(_float64(y))
+    over, lengths, k = np.zeros(starts, dtype=bool), np.zeros(starts), 0
+    raised = np.zeros(starts, dtype=bool)
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 
     def step(a: Tensor) -> Step:
-        nonlocal s, waited
+        nonlocal s, y, k
         applied = a.numpy().clip(low, high)
-        s, cost, waited = s.copy(), -waited, np.zeros(starts)
+        y, cost, going, k = y.copy(), np.zeros(starts), torch.as_tensor(~over)[:, None], k + 1
         lengths[~over] += 1
         for i in np.flatnonzero(~over):
             before = len(plant.raised)
-            s[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
+            y[i], reward, terminated, truncated, _ = envs[i].step(applied[i].astype(low.dtype))
             raised[i] |= len(plant.raised) > before
-            cost[i] -= float(reward)
+            cost[i] = -float(reward)
             over[i] = terminated or truncated
-        return Step(_float64(s), _float64(applied), _float64(cost))
+        u, now = _float64(applied), _float64(y)
+        if observer is not None:
+            now = observer.following(s, u, s[:, :0], now, k)
+        s = torch.where(going, now, s)
+        return Step(s, u, _float64(cost))
 
     shape = starts, len(plant.lb_a)
     last = torch.zeros(shape, dtype=torch.float64)
@@ -217,7 +220,7 @@ def gymnasium_loop(
         last = last if over.all() else policy(p)
         return last
 
-    loop = _run(act, _float64(s), step, steps, shape, gamma, len(plant.lb_s))
+    loop = _run(act, s, step, steps, shape, gamma)
     for env in envs:
         env.close()
     return replace(loop, lengths=_float64(lengths), raised=torch.from_numpy(raised))
@@ -230,7 +233,7 @@ def _run(
     steps: int,
     shape: tuple[int, ...],
     gamma: float,
-    n_y: int | None = None,
+    n_x: int | None = None,
 ) -> ClosedLoop:
     """Run ``policy``, which sees p ``(starts, n_p)`` first and returns actions of this shape."""
 
@@ -240,7 +243,7 @@ def _run(
 
     known, actions, costs = zip(*run_loop(act, p, step, steps), strict=True)
     known = torch.stack((p, *known))
-    return ClosedLoop(known, torch.stack(actions), torch.stack(costs), gamma, n_y)
+    return ClosedLoop(known, torch.stack(actions), torch.stack(costs), gamma, n_x)
 
 
 def _float64(x: np.ndarray) -> Tensor:

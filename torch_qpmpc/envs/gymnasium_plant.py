@@ -24,9 +24,9 @@ from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
 from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
-from torch_qpmpc.envs.past_window import first_window
-from torch_qpmpc.envs.window_observation import WindowObservation
+from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.innovations import Innovations
 
 #: The length of episodes of an environment that has no limit of its own.
 STEPS = 200
@@ -44,9 +44,8 @@ class GymnasiumPlant:
 
     Attributes:
         id, kwargs: the arguments.
-        past: L of the `WindowObservation` in place of the observation, see `windowed`; 1 for none.
-        lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_x,)`` and ``(n_u,)``, without a
-            window.
+        observer: the model whose estimated state takes the observation's place, see `observed`.
+        lb_s, ub_s, lb_a, ub_a: the bounds of its spaces, ``(n_y,)`` and ``(n_u,)``.
         max_steps: the environment's own ``max_episode_steps``; 200 if it has none.
         raised: the exceptions that ended episodes, as text. The last step of such an episode has a
             reward of NaN, and is not learned from.
@@ -61,8 +60,9 @@ class GymnasiumPlant:
 
     def __init__(self, id: str, **kwargs: Any) -> None:
         check_kind("task.id", id, str)
-        self.id, self.past, self.kwargs = id, 1, kwargs
+        self.id, self.kwargs = id, kwargs
         self.raised: list[str] = []
+        self.observer: Innovations | None = None
         try:
             env = self.make()
         except (gymnasium.error.Error, ImportError) as error:
@@ -78,11 +78,15 @@ class GymnasiumPlant:
         self.max_steps = (env.spec and env.spec.max_episode_steps) or STEPS
         env.close()
 
-    def windowed(self, past: int) -> GymnasiumPlant:
-        """Return this plant with a window of ``past`` outputs in place of the observation."""
-        check_whole("past", past, 1)
+    @property
+    def n_x(self) -> int:
+        """Entries of the state that a policy sees: the observation, or the model's state."""
+        return len(self.lb_s if self.observer is None else self.observer.A)
+
+    def observed(self, model: Innovations | None) -> GymnasiumPlant:
+        """Return this plant with the estimate of the state of ``model`` as its observation."""
         plant = copy.copy(self)
-        plant.past = past
+        plant.observer = model
         return plant
 
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
@@ -96,7 +100,7 @@ class GymnasiumPlant:
         env = TransformAction(_Guarded(env, self.raised), rounded, None)
         if isinstance(env.observation_space, Dict | Tuple):
             env = FlattenObservation(env)
-        return env if self.past == 1 else WindowObservation(env, self.past)
+        return env
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
@@ -133,6 +137,8 @@ class GymnasiumPlant:
             remedy = f"Remove it, as by pip uninstall gym: {gym.origin}."
             got = f"a broken one beside Gymnasium ({error})"
             raise QPError.expected("the module gym", got, "none", remedy) from error
+        if self.observer is not None:
+            env.append_transform(KalmanFilter(self.observer))
         env.set_seed(seed)
         return env
 
@@ -161,10 +167,11 @@ class GymnasiumPlant:
     def violation(self, s: Tensor) -> Tensor:
         """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``.
 
-        Of a window it is the last output.
+        Of a model's state it is that of the outputs.
         """
-        size = len(first_window(self.lb_s, self.past, self.lb_a))
-        s = check_tensor("s", s, size)[..., -len(self.lb_s) :].to(self.lb_s)
+        s = check_tensor("s", s, self.n_x).to(self.lb_s)
+        if self.observer is not None:
+            s = s @ torch.as_tensor(self.observer.C).mT
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
     def violations(self, batch: TensorDictBase) -> Tensor:

@@ -10,7 +10,7 @@ ones d come first, then those that no controller sees, such as noise.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
@@ -19,9 +19,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import Rng, moved
-from torch_qpmpc.envs.past_window import PastWindow
 from torch_qpmpc.envs.vectorised import VectorisedEnv
+from torch_qpmpc.mpc.innovations import Innovations
 
 #: The default number of different episodes of signals.
 EPISODES = 1024
@@ -35,7 +36,8 @@ class Plant(ABC):
         lb_a, ub_a: bounds of the action, ``(n_u,)``.
         n_y, n_d: the numbers of outputs and of known signals.
         horizon: N; the controller sees the known signals d_k, .., d_{k+N}.
-        past: L; the controller sees the last L outputs and the L - 1 actions between them.
+        observer: a model whose estimated state the controller sees in place of the output; None
+            for the output.
 
     Raises:
         QPError: if a number is out of range.
@@ -46,10 +48,10 @@ class Plant(ABC):
     n_y: int
     n_d: int = 0
     horizon: int = 1
-    past: int = 1
+    observer: Innovations | None = None
 
     def __post_init__(self) -> None:
-        for name, least in (("n_y", 1), ("n_d", 0), ("horizon", 1), ("past", 1)):
+        for name, least in (("n_y", 1), ("n_d", 0), ("horizon", 1)):
             check_whole(name, getattr(self, name), least)
 
     @property
@@ -58,18 +60,27 @@ class Plant(ABC):
         return len(self.lb_a)
 
     @property
+    def n_x(self) -> int:
+        """Entries of the output, or of the model's state, that a controller sees."""
+        return self.n_y if self.observer is None else len(self.observer.A)
+
+    @property
     def n_preview(self) -> int:
         """Entries of the known signals d_k, .., d_{k+N}."""
         return (self.horizon + 1) * self.n_d
 
     @property
     def n_p(self) -> int:
-        """Entries of p, what a controller sees: the known signals, then the window."""
-        return self.n_preview + self.past * self.n_y + (self.past - 1) * self.n_u
+        """Entries of p, what a controller sees: the known signals, then output or estimate."""
+        return self.n_preview + self.n_x
 
     def to(self, device: torch.device | str | None) -> Self:
         """Return the same plant with its tensors on ``device``."""
         return moved(self, device)
+
+    def observed(self, model: Innovations | None) -> Self:
+        """Return this plant with the estimate of the state of ``model`` in place of the output."""
+        return replace(self, observer=model)
 
     @abstractmethod
     def signals(self, rng: Rng, count: int, length: int) -> Tensor:
@@ -109,19 +120,19 @@ class Plant(ABC):
     ) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps.
 
-        Its observation is the window of the last ``past`` outputs and the actions between them.
-        ``seed`` seeds signals and starts; ``episodes`` is as in `PlantEnv`.
+        Its observation is the output or, with an ``observer``, the estimate of its state. ``seed``
+        seeds signals and starts; ``episodes`` is as in `PlantEnv`.
         """
         env = PlantEnv(self, num_envs, max_steps, seed=seed, episodes=episodes or EPISODES)
-        return env if self.past == 1 else TransformedEnv(env, PastWindow(self.past))
+        return env if self.observer is None else TransformedEnv(env, KalmanFilter(self.observer))
 
 
 class PlantEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` episodes of a `Plant`, as in `VectorisedEnv`.
 
     It emits the output y as ``observation`` ``(num_envs, n_y)``, and the known signals d_k, ..,
-    d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The transform `PastWindow`
-    turns the observation into the window of past outputs and actions.
+    d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The transform
+    `KalmanFilter` turns the observation into an estimate of the state.
 
     The seed draws the signals of ``episodes`` episodes; each reset chooses one of them at random.
     Hidden entries are ``state`` ``(num_envs, n_x)`` in float64, ``episode``, the index of the

@@ -91,7 +91,6 @@ class FromData(Group):
     transitions: Count
     levels: Literal["uniform", "binary"]
     hold: Annotated[float, Field(ge=1)]
-    ridge: NonNegative | None
 
 
 def _installed_logger(name: str) -> str:

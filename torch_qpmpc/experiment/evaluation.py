@@ -81,19 +81,17 @@ class Evaluation:
         """Evaluate what has been learned so far."""
         self.loops[name] = evaluate(self.cfg, policy, self.physics)
 
-    def identify(
-        self, data: Callable[[], Sequence[TensorDictBase]], held: Sequence[int] = ()
-    ) -> None:
+    def identify(self, data: Callable[[], Sequence[TensorDictBase]]) -> None:
         """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it.
 
-        ``data`` returns the logged steps, of which the model holds the outputs ``held``. J is that
-        of the better of `nominal_mpcs`, and nan if they identify no model.
+        ``data`` returns the logged steps. J is that of the better of `nominal_mpcs`, and nan if
+        they identify no model.
         """
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
             return
         try:
-            mpcs = nominal_mpcs(self.cfg, self.physics, data(), held)
+            mpcs = nominal_mpcs(self.cfg, self.physics, data())
         except QPError:
             self.rivals[IDENTIFICATION] = math.nan
         else:

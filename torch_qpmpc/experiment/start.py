@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,24 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torch_qpmpc.envs import GymnasiumPlant
+from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.choosing import choose, chosen_before
-from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
-from torch_qpmpc.files import read_tensors, write_whole
+from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.replay import Replay
+from torch_qpmpc.mpc.innovations import Innovations
 
+#: The share of the exploration that a second log adds to the actions of the best start.
+MIXED = 0.3
 #: The log in a run's folder.
 LOG = "log.pt"
+#: The model of a run's observer in its folder.
+OBSERVER = "observer.pt"
 #: The entries of a log; the preview is optional.
 NEXT = ("observation", "reward", "done", "terminated", "truncated")
 ENTRIES = ("observation", "preview", "action", *(("next", name) for name in NEXT))
@@ -74,9 +81,10 @@ class Exploration(nn.Module):
 def make_start(
     cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
 ) -> Start | None:
-    """Identify the start of a run from a log, and keep a log of the plant in the run's folder.
+    """Identify the start of a run from a log of the plant, which the run's folder keeps.
 
-    With ``task.start_episodes`` closed loops choose it, and the folder gets their table.
+    With ``task.start_episodes`` closed loops choose it, a second log is below the first one, and
+    the folder gets the table of the choice.
 
     Args:
         cfg: the run's configuration.
@@ -109,7 +117,7 @@ def make_start(
     if choice is not None:
         start = chosen_before(cfg, physics, log, choice)
     elif chosen:
-        start = choose(cfg, physics, log, quiet)
+        start, log = choose(cfg, physics, log, partial(collect_log, cfg, physics), quiet)
     else:
         start = identified_start(cfg, physics, log)
     if not written:
@@ -117,6 +125,9 @@ def make_start(
         torch.save(log.to_dict(), buffer)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, buffer.getbuffer())
+        if start.observer is not None:
+            content = {name: torch.as_tensor(x) for name, x in start.observer._asdict().items()}
+            save_file(path.with_name(OBSERVER), "observer", content)
         if start.choice is not None:
             start.choice.write(path.parent)
     if not quiet:
@@ -134,20 +145,31 @@ def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
     return start._replace(held=None)
 
 
-def collect_log(cfg: DictConfig, physics: AnyPlant) -> TensorDict:
+@torch.no_grad()
+def collect_log(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> TensorDict:
     """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments.
 
-    Those of a Gymnasium task have no window: an identification makes its own, from the first steps
-    of an episode on.
+    With a ``start``, its policy acts, and `MIXED` times the exploration is added. The observations
+    are the plant's own.
     """
-    start = cfg.start
-    physics = physics.windowed(1) if isinstance(physics, GymnasiumPlant) else physics
-    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
-    binary = start.levels == "binary"
-    explore: Any = Exploration(physics.lb_a, physics.ub_a, start.hold, binary, cfg.seed)
-    policy = TensorDictModule(explore, ["observation"], ["action"])
-    steps = -(-start.transitions // cfg.num_envs)
-    log = env.rollout(steps, policy, break_when_any_done=False).contiguous()
+    low, high, options = physics.lb_a, physics.ub_a, cfg.start
+    seed = cfg.seed + (start is not None)
+    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=seed)
+    explore: Any = Exploration(low, high, options.hold, options.levels == "binary", seed)
+    policy, key = explore, "observation"
+    if start is not None:
+        if start.observer is not None:
+            key = "estimate"
+            env = env.append_transform(KalmanFilter(start.observer, estimate_key=key))
+        act, middle = warm_policy(make_mpc(cfg, start.plant(physics), start)), (low + high) / 2
+
+        def policy(x: Tensor) -> Tensor:
+            u = act(x.double()) + MIXED * (explore(x.double()) - middle)
+            return u.clamp(low, high).to(x.dtype)
+
+    module = TensorDictModule(policy, [key], ["action"])
+    steps = -(-options.transitions // cfg.num_envs)
+    log = env.rollout(steps, module, break_when_any_done=False).contiguous()
     env.close()
     return log.select(*ENTRIES, strict=False)
 
@@ -156,6 +178,22 @@ def transitions(start: Start | None, replay: Replay) -> list[TensorDictBase]:
     """Return the logged steps of a run: those that it starts from, and those in its replay."""
     steps, _ = without_blow_ups(replay.steps().select(*ENTRIES, strict=False))
     return [steps] if start is None else [start.log, steps]
+
+
+def read_observer(folder: Path) -> Innovations | None:
+    """Read the model of a run's observer; None if the run has none.
+
+    Raises:
+        QPError: the file is damaged.
+    """
+    path = folder / OBSERVER
+    if not path.exists():
+        return None
+    content = load_file(path, "observer", "train.py")
+    try:
+        return Innovations(*(content[name].numpy() for name in Innovations._fields))
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(path, error, "the observer that a run wrote") from error
 
 
 def stored_log(path: str | Path) -> TensorDict:

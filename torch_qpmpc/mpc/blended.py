@@ -26,11 +26,10 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import banded_matrix
-from torch_qpmpc.mpc.identification import check_excitation, check_held
+from torch_qpmpc.mpc.identification import check_excitation
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import Trajectory, as_log, folds
 from torch_qpmpc.mpc.parameters import for_each
-from torch_qpmpc.mpc.predictor import transitions
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.validation import as_tensor
 
@@ -221,7 +220,6 @@ def identify_blended(
     trajectories: Any,
     horizon: int,
     centres: int | Sequence[int] = CENTRES,
-    held: Sequence[int] = (),
 ) -> BlendedModel:
     """Fit linear models at a few centres to logged trajectories.
 
@@ -230,7 +228,6 @@ def identify_blended(
         horizon: the number of steps over which predictions decide on the number of centres.
         centres: the number of centres; or several, among which the last fifth of the log decides.
             Those with more coefficients than the log has transitions are left out.
-        held: indices of outputs that the model holds, such as set-points, as in `identify`.
 
     Raises:
         QPError: an argument is invalid, the log has known signals, or does not determine a linear
@@ -257,30 +254,26 @@ def identify_blended(
         got = f"known signals {', '.join(log.known)}"
         raise QPError.expected("trajectories", got, "outputs and actions only")
     layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
-    held = check_held(held, layout.n_x)
-    check_excitation(log, layout)
+    check_excitation(log)
     data, coefficients = log.trajectories, layout.n + 1
     if isinstance(centres, Integral):
-        return _fit(data, layout, int(centres), held)
+        return _fit(data, layout, int(centres))
     counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]
     *parts, last = folds(data, PARTS)
     rest = [steps for part in parts for steps in part]
     variance = torch.cat([steps.y for steps in data]).var(0, correction=0)
-    variance[[*held]] = torch.nan  # left out
-    R2 = {count: _R2(_fit(rest, layout, count, held), last, horizon, variance) for count in counts}
-    model = _fit(data, layout, max(R2, key=lambda count: R2[count]), held)
+    R2 = {count: _R2(_fit(rest, layout, count), last, horizon, variance) for count in counts}
+    model = _fit(data, layout, max(R2, key=lambda count: R2[count]))
     model.R2 = R2
     return model
 
 
-def _fit(
-    data: Sequence[Trajectory], layout: Layout, count: int, held: Sequence[int]
-) -> BlendedModel:
-    """Fit ``count`` local models, which hold the outputs ``held``."""
-    X, Y = transitions(data, layout)
+def _fit(data: Sequence[Trajectory], layout: Layout, count: int) -> BlendedModel:
+    """Fit ``count`` local models."""
+    X = torch.cat([torch.cat((steps.y[:-1], steps.u), -1) for steps in data])
+    Y = torch.cat([steps.y[1:] for steps in data])
     x, n_x = X[:, : layout.n_x], layout.n_x
-    Y = Y - x  # an output that never changes stays where it is, as those that are held
-    Y[:, [*held]] = 0.0
+    Y = Y - x  # an output that never changes stays where it is
     middle, size = x.mean(0), x.std(0, correction=0)
     size = torch.where(size > 1e-12 * x.abs().amax(0), size, 1.0)
     centres = _centres((x - middle) / size, count)

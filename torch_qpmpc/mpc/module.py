@@ -8,7 +8,7 @@ appear only in `torch_qpmpc.learning`.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -25,7 +25,8 @@ from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
-from torch_qpmpc.mpc.identification import identify
+from torch_qpmpc.mpc.identification import measured_model, model_arguments
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
@@ -238,24 +239,21 @@ class QPMPC(nn.Module):
         trajectories: Any,
         horizon: int,
         *,
-        past: int = 1,
         n_d: int | None = None,
         n_x: int | None = None,
-        structure: str = "free",
-        causal: bool = True,
-        ridge: float | None = None,
-        held: Sequence[int] = (),
         **options: Any,
     ) -> Self:
-        """Return a QPMPC whose C and b start from least squares on logged trajectories.
+        """Return a QPMPC whose model is fitted to logged trajectories, with the outputs as state.
 
-        C_0 is the banded matrix of an ARX model; `identify` returns it with its prediction errors.
+        For a state that the outputs show in part, `identify` a model: its ``arguments`` are those
+        of `of`, and a `torch_qpmpc.envs.KalmanFilter` estimates the state.
+
         Without ``stage_weight`` the cost is fitted to the rewards of the log
         (`torch_qpmpc.mpc.stage_cost`), with a warning if it explains them poorly. It is dense, as
         set-points among the observations need it, unless ``hessian="diagonal"`` is passed.
 
         Args:
-            trajectories, horizon, past, n_d, n_x, structure, causal, ridge, held: see `identify`.
+            trajectories, horizon, n_d, n_x: see `identify`.
             options: as in `of`, such as cost and bounds.
 
         Raises:
@@ -272,28 +270,17 @@ class QPMPC(nn.Module):
             (4, 4)
         """
         check_names(options)
-        identified = identify(
-            trajectories,
-            horizon,
-            past=past,
-            n_d=n_d,
-            n_x=n_x,
-            structure=structure,
-            causal=causal,
-            ridge=ridge,
-            held=held,
-        )
-        arguments = {**identified.arguments, **options}
-        starts = [identified.arguments.get("start", {}), options.get("start") or {}]
+        model, log = measured_model(trajectories, n_x, n_d)
+        arguments = {**model_arguments(model), "horizon": horizon, **options}
         if arguments.get("stage_weight") is None:
-            hessian, layout = arguments.setdefault("hessian", "block"), identified.options.layout
-            fitted = fit_rewards(trajectories, layout, hessian == "diagonal").now
+            hessian = arguments.setdefault("hessian", "block")
+            layout = Layout(len(log.outputs), len(log.inputs), horizon, n_d=len(log.known))
+            fitted = fit_rewards(trajectories, layout, hessian == "diagonal", model)
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
             arguments["stage_weight"] = cost.stage_weight
             if arguments.get("terminal_weight") is None:
                 arguments["terminal_weight"] = cost.terminal_weight
-            starts.insert(0, {"q": cost.q, "c": cost.c})
-        arguments["start"] = {name: x for part in starts for name, x in part.items()}
+            arguments["start"] = {"q": cost.q, "c": cost.c} | (options.get("start") or {})
         return cls.of(**arguments)
 
     @classmethod

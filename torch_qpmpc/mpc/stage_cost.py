@@ -79,9 +79,7 @@ class _Observed(NamedTuple):
         return W[self.n_free :, self.n_free :]
 
 
-def fit_stage_cost(
-    v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False, n_apart: int = 0
-) -> StageCost:
+def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False) -> StageCost:
     """Fit a stage cost whose W is positive semidefinite, except in its first rows and columns.
 
     It is ridge regression about a typical v, in units in which columns have unit variance. The
@@ -95,8 +93,6 @@ def fit_stage_cost(
         n_free: the number of first entries of v, such as d, whose rows and columns of W
             have any sign; they are zero in a diagonal W.
         diagonal: fit a diagonal W.
-        n_apart: the number of last entries of v, such as u, without cross terms with the
-            others.
 
     Raises:
         QPError: there are no rows, or entries that are not finite or too large.
@@ -115,7 +111,6 @@ def fit_stage_cost(
     rows, columns = torch.triu_indices(n, n)
     # A diagonal W has no entries of d.
     kept = (rows == columns) & (rows >= n_free) if diagonal else rows >= 0
-    kept &= (rows < n - n_apart) == (columns < n - n_apart)
     rows, columns = rows[kept], columns[kept]
     seen = _Observed((v - middle) * scale, cost / unit, rows, columns, rows < n_free, n_free)
     W, q, c = _fit(seen)

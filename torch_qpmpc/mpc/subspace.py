@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.special
 import torch
 
 from torch_qpmpc.mpc.innovations import Array, Innovations
@@ -44,6 +45,11 @@ HORIZONS = (1, 2, 5, 10, 20)
 #: The smallest order is chosen whose squared errors are above the best's by less than this share,
 #: in the geometric mean. Errors below EXACT, as a share of the variance, are none.
 MARGIN, EXACT = 0.004, 1e-8
+#: Outputs may be unmoved if they are constant in this share of the steps; the number of past inputs
+#: in the test, and its level.
+CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
+#: So many orders in turn that are no better end the search.
+PATIENCE = 3
 #: Autocorrelations of the residuals in the test of whiteness.
 CORRELATIONS = 20
 
@@ -126,17 +132,21 @@ def fit_state_space(
 
 
 def held_out_errors(
-    trajectories: Sequence[Trajectory], order: int, lags: int, horizon: int, count: int = PARTS
+    trajectories: Sequence[Trajectory], order: int, lags: int, horizon: int
 ) -> Array:
-    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their part."""
-    parts, errors = folds(trajectories, count), []
+    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their part.
+
+    Those of the first ``lags`` steps of long trajectories, in which the filter settles, are left
+    out.
+    """
+    parts, errors = folds(trajectories, PARTS), []
     for i, part in enumerate(parts):
-        model = fit_state_space([x for j, p in enumerate(parts) if j != i for x in p], order, lags)[
-            0
-        ]
-        errors += [
-            model.errors(one.y.numpy(), one.u.numpy(), one.d.numpy(), horizon) for one in part
-        ]
+        others = [one for j, other in enumerate(parts) if j != i for one in other]
+        model = fit_state_space(others, order, lags).model
+        for one in part:
+            settled = lags if one.steps > 2 * lags else 0
+            y, u, d = (x.numpy() for x in one)
+            errors.append(model.errors(y, u, d, horizon)[settled:])
     return np.concatenate(errors)
 
 
@@ -181,11 +191,14 @@ def _compare(
             return rows
     for p in lags:
         starts = [_predictor(data, p) for data, _ in folds]
+        best, misses = np.inf, 0
         for n in orders:
-            if n <= min(len(start.s) for start in starts):
+            if n <= min(len(start.s) for start in starts) and misses < PATIENCE:
                 pairs = zip(starts, folds, strict=True)
                 models = [steady(em(_states(start, n), data, FEW)) for start, (data, _) in pairs]
                 rows.append(Candidate(n, p, _score(models, folds)))
+                misses = 0 if rows[-1].score < best - MARGIN else misses + 1
+                best = min(best, rows[-1].score)
     return rows
 
 
@@ -212,31 +225,28 @@ def _best(rows: Sequence[Candidate]) -> Candidate:
 class _Normal:
     """Outputs, inputs and known signals of unit variance.
 
-    Outputs that never change in a trajectory are known signals of the others.
+    Outputs that no input moves are known signals of the others, and stay where they are.
     """
 
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
-        y = [x.y.numpy() for x in trajectories]
-        low, high = (np.array([f.reduce(x) for x in y]) for f in (np.fmin, np.fmax))
-        moving = (high > low).any(0)
-        self.still = np.asarray(~moving & moving.any())
-        self.held = np.where(np.isfinite(high), high, np.nanmean(high, 0))[:, self.still]
-        self.n_u = trajectories[0].u.shape[1]
-        self.y, self.y_size = _scale(np.concatenate(y)[:, ~self.still])
+        self.apart, self.n_u = _unmoved(trajectories), trajectories[0].u.shape[1]
+        y = np.concatenate([x.y.numpy() for x in trajectories])
+        held = [_filled(x.y.numpy()[:, self.apart]) for x in trajectories]
+        self.first = np.array([x[0] for x in held])
+        self.changes = np.concatenate([np.diff(x, axis=0) for x in held])
+        self.y, self.y_size = _scale(y[:, ~self.apart])
         self.v, self.v_size = _scale(np.concatenate([self._known(x) for x in trajectories]))
 
     def _known(self, one: Trajectory) -> Array:
         y, u, d = (x.numpy() for x in one)
-        held = np.fmax.reduce(y[:, self.still])
-        held = np.where(np.isfinite(held), held, self.held.mean(0))
-        return np.hstack((u, d, np.tile(held, (len(u), 1))))
+        return np.hstack((u, d, _filled(y[:, self.apart])[:-1]))
 
     def apply(self, trajectories: Sequence[Trajectory]) -> list[Signals]:
         """Return the signals."""
         data = []
         for one in trajectories:
             v = (self._known(one) - self.v) / self.v_size
-            y = (one.y.numpy()[:, ~self.still] - self.y) / self.y_size
+            y = (one.y.numpy()[:, ~self.apart] - self.y) / self.y_size
             data.append(Signals(y, np.hstack((v, np.ones((len(v), 1))))))
         return data
 
@@ -253,20 +263,20 @@ class _Normal:
         S = self.y_size[:, None] * model.S * self.y_size
         C, L = self.y_size[:, None] * model.C, model.L / self.y_size
         model = model._replace(B=B, offset=offset, C=C, L=L, S=S)
-        return self._with_still(model.transformed(np.diag(size), np.diag(1 / size), shift))
+        return self._with_apart(model.transformed(np.diag(size), np.diag(1 / size), shift))
 
-    def _with_still(self, model: Innovations) -> Innovations:
-        """Return the model with outputs that never change, as states that stay."""
-        n_y, n, count = len(self.still), len(model.A), int(self.still.sum())
+    def _with_apart(self, model: Innovations) -> Innovations:
+        """Return the model with outputs that no input moves, as states that stay."""
+        n_y, n, count = len(self.apart), len(model.A), int(self.apart.sum())
         n_d = model.B.shape[1] - self.n_u - count
         outputs = np.argsort(
-            np.concatenate((np.flatnonzero(~self.still), np.flatnonzero(self.still)))
+            np.concatenate((np.flatnonzero(~self.apart), np.flatnonzero(self.apart)))
         )
         hidden = np.arange(n_y - count, n)
         states = np.concatenate(
             (np.where(outputs < n_y - count, outputs, outputs + len(hidden)), hidden)
         )
-        one, zero = np.eye(count), np.zeros((count, count))
+        one, S = np.eye(count), self.changes.T @ self.changes / len(self.changes)
 
         def joined(M: Array, other: Array) -> Any:
             return scipy.linalg.block_diag(M, other)
@@ -274,7 +284,7 @@ class _Normal:
         A = joined(model.A, one)
         A[:n, n:] = model.B[:, self.n_u + n_d :]
         B = np.pad(model.B, ((0, count), (0, 0)))[states]
-        spread = np.cov(self.held.T, bias=True).reshape(count, count)
+        spread = np.cov(self.first.T, bias=True).reshape(count, count) - S
         return Innovations(
             A[np.ix_(states, states)],
             B[:, : self.n_u],
@@ -282,10 +292,38 @@ class _Normal:
             np.pad(model.offset, (0, count))[states],
             np.eye(n_y, n + count),
             joined(model.L, one)[np.ix_(states, outputs)],
-            joined(model.S, zero)[np.ix_(outputs, outputs)],
-            np.concatenate((model.x0, self.held.mean(0)))[states],
+            joined(model.S, S)[np.ix_(outputs, outputs)],
+            np.concatenate((model.x0, self.first.mean(0)))[states],
             joined(model.P0, spread)[np.ix_(states, states)],
         )
+
+
+def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
+    """Return True for outputs that never change, or seldom and whatever the inputs, ``(n_y,)``.
+
+    Changes of an output that is constant in most steps, such as a set-point, are regressed on the
+    last inputs and their squares. An F-test of 1 % decides whether these explain them.
+    """
+    changes = np.concatenate([np.diff(x.y.numpy(), axis=0) for x in trajectories])
+    unmoved: Any = ~(np.abs(np.nan_to_num(changes)) > 0).any(0)
+    seldom = np.flatnonzero(~unmoved & ((changes == 0).mean(0) >= CONSTANT))
+    use = [x for x in trajectories if x.steps > LAST]
+    if not len(seldom) or not use:
+        return unmoved & ~unmoved.all()
+    windows = [np.lib.stride_tricks.sliding_window_view(x.u.numpy(), LAST, 0) for x in use]
+    U = np.concatenate([w.reshape(len(w), -1) for w in windows])
+    U = np.hstack((np.ones((len(U), 1)), U, U**2))
+    after = np.concatenate([np.diff(x.y.numpy()[LAST - 1 :, seldom], axis=0) for x in use])
+    for i, target in zip(seldom, after.T, strict=True):
+        X, target = U[np.isfinite(target)], target[np.isfinite(target)]
+        rest = target - X @ np.linalg.lstsq(X, target, rcond=None)[0]
+        m, left = X.shape[1] - 1, len(X) - X.shape[1]
+        if left > 0:
+            explained = ((target - target.mean()) ** 2).sum() - rest @ rest
+            unmoved[i] = (
+                scipy.special.fdtrc(m, left, explained / max(rest @ rest, TINY) * left / m) > LEVEL
+            )
+    return unmoved & ~unmoved.all()
 
 
 def _scale(x: Array) -> tuple[Array, Array]:

@@ -24,13 +24,15 @@ from torch_qpmpc.analysis.structure import (
     predictions,
     second_moment,
 )
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem
+from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import learned_qp
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import NUMBERS, read_metrics, read_summary
+from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
 from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The paper's cases, in its order.
@@ -70,10 +72,15 @@ class FinishedRun:
     @cached_property
     def physics(self) -> AnyPlant:
         """The plant, if `has_plant`."""
-        plant = make_physics(self.cfg)
-        if not isinstance(plant, GymnasiumPlant):
+        plant, observer = make_physics(self.cfg), self.observer
+        if observer is None or isinstance(plant, LinearSystem):
             return plant
-        return plant.windowed(self.summary.get("past", plant.past))
+        return plant.observed(observer)
+
+    @cached_property
+    def observer(self) -> Innovations | None:
+        """The model whose estimated state the policy acts on; None if it acts on the outputs."""
+        return read_observer(self.folder)
 
     @cached_property
     def start(self) -> QPMPC:

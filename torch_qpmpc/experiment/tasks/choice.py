@@ -1,9 +1,8 @@
-"""The table of the starts that a log allows; closed loops on the plant have chosen one."""
+"""The table of the starts that two logs allow; closed loops on the plant have chosen one."""
 
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +16,9 @@ from torch_qpmpc.files import damaged, write_whole
 
 #: The table in a run's folder.
 STARTS = "starts.csv"
-MEAN_ACTION = "mean action of the log"
-#: The starts that hold an action.
-HELD = {ZERO_ACTION, MEAN_ACTION}
-NO_WINDOW = "If one observation hides a part of the state, such as a velocity, try task.past=2."
 NOTHING = (
     "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
-    "of this log controls the plant: pass a log about the states where the controller is to work "
+    "of these logs controls the plant: pass a log about the states where the controller is to work "
     "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
     "plant's own cost (task.stage_weight), or a theta from a network: 'Scheduled and nonlinear "
     "plants' in the guides."
@@ -31,22 +26,19 @@ NOTHING = (
 
 
 class Row(NamedTuple):
-    """A start: its prediction, its episodes, and True if it is the ``chosen`` one.
+    """A start, and True if it is the ``chosen`` one.
 
-    ``R2`` is the share of the outputs' variance that is predicted N steps ahead in parts of the log
-    that are held out, in the mean over the outputs that the model does not hold; ``J`` the mean
-    cost of the ``episodes``, ``error`` its standard error, and ``transitions`` at most the number
-    of their steps: those that end early have fewer, in the mean ``length``. R2 is NaN for starts
-    without such a prediction: those that hold an action, and one of single steps.
+    ``J`` is the mean cost of its ``episodes``, ``error`` the standard error of that,
+    ``transitions`` at most the number of their steps, and ``lasted`` the number without those
+    after an episode's end.
     """
 
-    R2: float
-    episodes: int
-    J: float
-    error: float
-    transitions: int
-    chosen: bool
-    length: float = math.nan
+    episodes: int = 0
+    J: float = 0.0
+    error: float = 0.0
+    transitions: int = 0
+    lasted: float = 0.0
+    chosen: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,43 +54,39 @@ class Choice:
 
     @property
     def scheme(self) -> str:
-        """The name of the best start that holds no action, with which learning begins."""
-        best_first = (name for name, _ in self._ranked if name not in HELD)
-        return next(best_first) if self.name in HELD else self.name
+        """The name of the best start that is not zero action, with which learning begins."""
+        return next(name for name, _ in self._ranked if name != ZERO_ACTION)
 
     @property
     def _ranked(self) -> list[tuple[str, Row]]:
-        """The rows, best first; the run's own wins a tie."""
         return sorted(self.rows.items(), key=lambda item: (-item[1].episodes, item[1].J))
+
+    @property
+    def transitions(self) -> int:
+        """At most the number of steps of all closed loops."""
+        return sum(row.transitions for row in self.rows.values())
 
     @property
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json."""
-        return {"start": self.name, "start_transitions": self._transitions}
-
-    @property
-    def _transitions(self) -> int:
-        return sum(row.transitions for row in self.rows.values())
+        return {"start": self.name, "start_transitions": self.transitions}
 
     def __str__(self) -> str:
         width = max(map(len, self.rows))
         lines = [
-            f"{'start':{width}}{'R2':>8}{'episodes':>10}  "
+            f"{'start':{width}}{'episodes':>10}  "
             "J +- standard error (compare rows of equal episodes)"
         ]
         for name, row in self._ranked:
-            R2 = "" if math.isnan(row.R2) else f"{row.R2:.3f}" if row.R2 > -100 else "< -100"
             J = f"{cost_text(row.J)} +- {cost_text(row.error)}"
-            lines.append(f"{name:{width}}{R2:>8}{row.episodes:10}  {J}")
-        lines.append(
-            f"Chosen by at most {self._transitions:,} transitions of the plant: {self.name}"
-        )
+            lines.append(f"{name:{width}}{row.episodes:10}  {J}")
         chosen = self.rows[self.name]
-        if chosen.length < (steps := chosen.transitions / max(chosen.episodes, 1)):
-            lines.append(
-                f"Its episodes end after {chosen.length:.0f} of {steps:.0f} steps in the mean."
-            )
-        lines += [NO_WINDOW] * (not any("past=" in name for name in self.rows))
+        lines.append(
+            f"Chosen by at most {self.transitions:,} transitions beside the logs': {self.name}"
+        )
+        if chosen.lasted < chosen.transitions:
+            length, steps = (x / chosen.episodes for x in (chosen.lasted, chosen.transitions))
+            lines.append(f"Its episodes end after {length:.0f} of {steps:.0f} steps in the mean.")
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
 
     def write(self, folder: Path) -> None:
@@ -119,16 +107,10 @@ class Choice:
         if not file.exists():
             return None
         try:
-            numbers = ("R2", "J", "error", "length")
-            exact = dict.fromkeys(numbers, _number)  # pandas before 3.1 rounds
+            exact = dict.fromkeys(("J", "error", "lasted"), float)  # pandas before 3.1 rounds
             table = pd.read_csv(file, index_col="start", converters=exact)
             choice = cls({str(name): Row(*row) for name, *row in table.itertuples()})
-            _ = choice.name
+            _ = choice.name, choice.scheme
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(file, error, "the table of starts that a run wrote") from error
         return choice
-
-
-def _number(text: str) -> float:
-    """Return the number in a cell; nan if it is empty."""
-    return float(text or "nan")

@@ -30,7 +30,7 @@ def _is_chosen(id: str) -> str:
 Given = Matrix | None
 
 
-#: The length of episodes, null for the environment's own; or of a window, null for the start's.
+#: The length of episodes, null for the environment's own.
 Steps = Count | None
 
 
@@ -42,12 +42,8 @@ class GymnasiumSettings(TaskSettings):
     eval_steps: Steps  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
     observation_bounds: bool
-    #: L of the window of outputs and actions that the QP sees; null: the chosen start sets it.
-    past: Steps = None
     #: Episodes by which a start from data is chosen; 0 for the run's own start.
     start_episodes: Whole = 0
-    #: Entries of the observation that are held over the horizon; null for those found in the log.
-    held: list[Whole] | None = None
 
     id: Annotated[str, AfterValidator(_is_chosen)]
     kwargs: dict[str, Any] | None = None
@@ -77,7 +73,7 @@ def make_plant(cfg: DictConfig) -> GymnasiumPlant:
         remedy = "Name it on the command line with task.id=MODULE:ID, or import it before."
         raise QPError.expected("task.id", got, expected, remedy)
     kwargs: Any = OmegaConf.to_container(OmegaConf.create(cfg.task.get("kwargs") or {}))
-    return GymnasiumPlant(cfg.task.id, **kwargs).windowed(cfg.task.get("past") or 1)
+    return GymnasiumPlant(cfg.task.id, **kwargs)
 
 
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
@@ -89,13 +85,10 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     Raises:
         QPError: a matrix is missing, or does not have the shape of the environment's spaces.
     """
-    n_x, n_u = len(plant.lb_s), len(plant.lb_a)
+    n_x, n_u = plant.n_x, len(plant.lb_a)
     needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
     spaces = f"{plant.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
     matrices: dict[str, Any] = dict.fromkeys(needed)
-    if plant.past > 1 and cfg.start.name != "data":
-        got, remedy = f"{plant.past} with a model that is given", "Start from data: start=data."
-        raise QPError.expected("task.past", got, "1", remedy)
     for name, shape in needed.items():
         rows = cfg.task[name]
         if rows is not None:
@@ -116,9 +109,11 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         remedy = "" if cfg.start.name == "data" else REMEDY
         raise QPError.expected("task.id", f"{spaces}, with {got}", expected, remedy)
     model = Model(matrices["A"], matrices["B"])
-    unbounded = torch.full_like(plant.lb_s, torch.inf)
-    states = None if cfg.task.observation_bounds else (-unbounded, unbounded)
-    return plant_scheme(cfg, plant, model, matrices["stage_weight"], states)
+    states = torch.full((2, n_x), torch.inf, dtype=torch.float64)
+    states[0] = -states[0]
+    if cfg.task.observation_bounds:  # the outputs are the first states
+        states[0, : len(plant.lb_s)], states[1, : len(plant.ub_s)] = plant.lb_s, plant.ub_s
+    return plant_scheme(cfg, plant, model, matrices["stage_weight"], (states[0], states[1]))
 
 
 register(

@@ -13,124 +13,157 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_qpmpc.envs import GymnasiumPlant
+from torch_qpmpc.envs import KalmanFilter, LinearSystem, Plant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
-from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task, plant_layout
+from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
 from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.identification import check_excitation, measured_model
+from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import as_log, valid_steps
+from torch_qpmpc.mpc.log import NEXT, as_log, kept_steps, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.rewards import RewardCost, fit_rewards, scheme_cost
+from torch_qpmpc.mpc.rewards import GOOD, fit_rewards, poor, scheme_cost
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
-from torch_qpmpc.mpc.roles import unmoved
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.tightening import back_off, tighten
+from torch_qpmpc.mpc.stage_cost import StageCost
+from torch_qpmpc.mpc.subspace import fit_state_space
+from torch_qpmpc.mpc.tightening import back_off
 
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
-    ``cut`` is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that
-    the policy holds, by a cost of its own; None for the policy of the fitted cost.
-    ``choice`` is the table of starts that it was chosen from, if it was. ``blended`` is the QP's
-    schedule, in the place of the identified model; None without one. ``riccati`` is True if the
-    cost of x_N is the regulator's. ``still`` has the outputs that hardly move near where episodes
-    begin, if the model and the cost are fitted there; else None. ``print`` shows ``cut``, the
-    errors of the model and the cost, and that table.
+    The observation of ``log`` is the state of ``model``: where the plant is ``observed``, the
+    estimate by its filter; ``order`` is as in `fit_state_space`. ``horizon`` is the QP's. ``cut``
+    is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that the
+    policy holds, by a cost of its own; None for the policy of the fitted cost. ``choice`` is the
+    table of starts that it was chosen from, if it was. ``blended`` is the QP's schedule, in the
+    place of the model; None without one. ``riccati`` is True if the cost of x_N is the
+    regulator's. ``print`` shows ``cut``, the model, the fit of the cost, and that table.
     """
 
     log: Any
-    identified: Identified
-    cost: RewardCost | None = None
+    model: Innovations
+    horizon: int
+    order: int = 0
+    observed: bool = False
+    cost: StageCost | None = None
     cut: int = 0
     held: Tensor | None = None
     choice: Choice | None = None
     blended: BlendedModel | None = None
     riccati: bool = False
-    still: Sequence[int] | None = None
 
     @property
-    def outputs_held(self) -> list[int]:
-        """The outputs that a model of the whole log holds, too."""
-        return [i for i in self.identified.options.held if i not in (self.still or ())]
+    def observer(self) -> Innovations | None:
+        """The model of the plant's observer, if it has one."""
+        return self.model if self.observed else None
+
+    @property
+    def layout(self) -> Layout:
+        """The sizes of the QP."""
+        (n, n_u), n_d = self.model.B.shape, self.model.E.shape[1]
+        return Layout(n, n_u, self.horizon, n_d=n_d)
 
     def plant(self, physics: AnyPlant) -> AnyPlant:
-        """Return ``physics``, whose observation has the window of this start's model."""
-        if not isinstance(physics, GymnasiumPlant):
+        """Return ``physics``, whose observation is the estimate of this start's observer."""
+        if not self.observed or isinstance(physics, LinearSystem):
             return physics
-        return physics.windowed(self.identified.options.layout.past)
+        return physics.observed(self.model)
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
-        held, names = self.outputs_held, self.identified.log.outputs
-        known = f"Held at their last value over the horizon: {', '.join(names[i] for i in held)}"
-        known += f", as by task.held={[*held]}"
+        poles = ", ".join(f"{abs(pole):.3g}" for pole in self.model.poles)
         count = 0 if self.blended is None else len(self.blended.centres)
         blended = f"Linear models at {count} centres, blended, take the place of the model above."
-        still = ", ".join(names[i] for i in self.still or ()) or "none"
-        local = "The model and the cost are those of the steps nearest to where episodes begin, "
-        local += f"one by one. Outputs that hardly move there, and are held: {still}"
-        parts = (cut if self.cut else None, self.identified, blended if count else None)
-        parts += (None if self.still is None else local,)
-        parts += known if held else None, self.cost, self.choice
-        return "\n".join(str(part) for part in parts if part is not None)
+        parts = [cut] * (self.cut > 0)
+        parts += [f"Model of order {len(self.model.A)}, with poles of sizes {poles}"]
+        parts += [blended] * (count > 0)
+        if self.cost is not None:
+            R2 = self.cost.R2
+            parts += [f"stage cost fitted to the rewards: R2 {R2:.3f}"]
+            parts += [poor(R2)] * (not R2 >= GOOD)
+        return "\n".join(str(part) for part in (*parts, self.choice) if part is not None)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The entries of summary.json: episodes cut, outputs held, window, and fits of the cost."""
-        held = self.outputs_held
+        """The entries of summary.json: episodes cut, the model's order, and the cost's fit."""
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
-        entries |= {"outputs_held": held} if held else {}
-        past = self.identified.options.layout.past
-        entries |= {"past": past} if past > 1 else {}
+        entries |= {"order": len(self.model.A)} if self.observed else {}
         entries |= {} if self.choice is None else self.choice.summary
-        if self.cost is None:
-            return entries
-        now, after = self.cost.now, self.cost.after
-        R2 = {"R2_cost": now.R2, "R2_cost_next": torch.nan if after is None else after.R2}
-        return entries | R2 | {"cost_of_next": self.cost.shifted}
+        return entries | ({} if self.cost is None else {"R2_cost": self.cost.R2})
 
 
-def identified_start(cfg: DictConfig, physics: AnyPlant, log: Any) -> Start:
-    """Identify C, b and a missing stage cost from a log of the plant; `identify` names errors."""
+def identified_start(
+    cfg: DictConfig, physics: AnyPlant, log: Any, order: int | None = None
+) -> Start:
+    """Identify the model and a missing stage cost from a log of the plant; see `identify`.
+
+    The state is the estimate by the filter of a model of this ``order``, None for the one that
+    `fit_state_space` chooses. That of a `LinearSystem` is measured.
+    """
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
-    layout = plant_layout(physics, cfg.task.horizon)
-    held = cfg.task.held if "held" in cfg.task else []
-    if held is None:
-        held = unmoved(as_log(log, layout.n_x).trajectories, cfg.task.horizon)
-    structure, ridge = cfg.constraint.structure, cfg.start.ridge
-    identified = identified_model(log, layout, structure, held, ridge)
-    cost = None
-    if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is None:
-        cost = _fitted(cfg, log, identified.options.layout)
-    return Start(log, identified, cost, cut)
+    observed = not isinstance(physics, LinearSystem)
+    if observed:
+        sizes = (physics.n_y, physics.n_d) if isinstance(physics, Plant) else (physics.n_x, 0)
+        data = as_log(log, *sizes)
+        check_excitation(data)
+        model, order, *_ = fit_state_space(data.trajectories, order)
+        physics, log = physics.observed(model), estimated(log, model)
+    else:
+        model, order = measured_model(log)[0], 0
+    start = Start(log, model, cfg.task.horizon, order, observed, cut=cut)
+    if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is not None:
+        return start
+    diagonal = cfg.task.hessian == "diagonal"
+    return start._replace(cost=fit_rewards(log, start.layout, diagonal, model))
+
+
+def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:
+    """Return a log, ``(T,)`` or ``(episodes, T)``, with estimates in the place of its outputs.
+
+    They begin anew where a trajectory of `as_log` does.
+    """
+    rows = log if log.batch_dims == 2 else log.unsqueeze(0)
+    y, following, u = (rows[key].double() for key in ("observation", NEXT, "action"))
+    n_d = observer.E.shape[-1]
+    d = rows["preview"][..., :n_d].double() if n_d else u[..., :0]
+    ends = rows.get(("next", "done"), torch.zeros_like(y[..., :1], dtype=torch.bool))[..., 0]
+    ends = ends | ~kept_steps(rows)
+    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1)
+    model, pairs = KalmanFilter(observer), []
+    x = model.first(y[:, 0])
+    step = torch.zeros(len(x), dtype=torch.int64)
+    for k in range(y.shape[1]):
+        step = step + 1
+        after = model.following(x, u[:, k], d[:, k], following[:, k], step)
+        pairs.append((x, after))
+        if k + 1 < y.shape[1]:
+            x = torch.where(ends[:, k, None], model.first(y[:, k + 1]), after)
+            step = torch.where(ends[:, k], 0, step)
+    now, after = (torch.stack(part, 1).reshape(*log.shape, -1) for part in zip(*pairs, strict=True))
+    return log.clone(recurse=False).set("observation", now).set(NEXT, after)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
-    identified, cost = start.identified, scheme.cost
-    predictor = () if identified.options.structure == "tied" else identified.constraints
+    cost = scheme.cost
     if cost.stage_weight is None:
-        cost = observed_cost(cfg, start.log, identified.options.layout, start.cost)
-        if is_regulated(cfg, start):
+        cost = _observed_cost(cfg, start)
+        if start.riccati or cfg.task.terminal_weight == "riccati":
             cost = regulator_cost(cost, start, scheme.gamma)
-    scheme = replace(
-        scheme,
-        layout=identified.options.layout,
-        model=Model(*identified.model, *predictor),
-        cost=cost,
-    )
+    model, layout = _scheme_model(start.model), start.layout
+    scheme = replace(scheme, layout=layout, model=model, cost=cost)
     return scheme if start.held is None else _holding(scheme, start)
 
 
-def is_regulated(cfg: DictConfig, start: Start) -> bool:
-    """Return True if a fitted cost of x_N is to be the regulator's."""
-    return start.cost is not None and (start.riccati or cfg.task.terminal_weight == "riccati")
+def _scheme_model(model: Innovations) -> Model:
+    """Return the model of a scheme."""
+    return Model(*(torch.tensor(part) for part in (model.A, model.B, model.E, model.offset)))
 
 
 def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
@@ -141,26 +174,21 @@ def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
     Raises:
         QPError: as in `terminal_riccati`.
     """
-    layout, model, fitted = start.identified.options.layout, start.identified.model, start.cost
+    layout, model = start.layout, start.model
+    A, B, offset = (torch.tensor(part) for part in (model.A, model.B, model.offset))
+    first, fitted = cost.q[: -layout.n_x], start.cost
     assert fitted is not None
-    first = cost.q[: -layout.n_x]
     if layout.n_d:
-        P = terminal_riccati(model.A, model.B, cost.stage_weight, gamma, layout)
+        P = terminal_riccati(A, B, cost.stage_weight, gamma, layout)
         return replace(cost, terminal_weight=P, q=F.pad(first, (0, layout.n_x)))
-    # Outputs that are still have neither a weight nor an effect, and no action moves them.
-    moving = torch.tensor([i for i in range(layout.n_x) if i not in (start.still or ())])
-    both = torch.cat((moving, torch.arange(layout.n_x, layout.n)))
-    sizes = replace(layout, n_x=len(moving))
-    A, B, offset = model.A[moving][:, moving], model.B[moving], model.offset[moving]
-    W, q, c = fitted.best.W[both][:, both], fitted.best.q[both], cost.c
-    P = terminal_riccati(A, B, W, gamma, sizes)
+    P = terminal_riccati(A, B, fitted.W, gamma, layout)
     values, vectors = torch.linalg.eigh(P)
     P = vectors * values.clamp(min=0) @ vectors.mT  # up to rounding, it is that
-    p, ahead = affine_cost_to_go(A, B, offset, W, q, P, gamma)
+    p, ahead = affine_cost_to_go(A, B, offset, fitted.W, fitted.q, P, gamma)
+    c = cost.c
     if gamma < 1:
-        c = fitted.best.c / (1 - gamma) + gamma**layout.horizon * ahead
-    into = torch.eye(layout.n_x, dtype=P.dtype)[:, moving]
-    return replace(cost, terminal_weight=into @ P @ into.mT, q=torch.cat((first, into @ p)), c=c)
+        c = fitted.c / (1 - gamma) + gamma**layout.horizon * ahead
+    return replace(cost, terminal_weight=P, q=torch.cat((first, p)), c=c)
 
 
 def _holding(scheme: Scheme, start: Start) -> Scheme:
@@ -188,42 +216,30 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
 
-def observed_cost(
-    cfg: DictConfig, log: TensorDictBase, layout: Layout, fitted: RewardCost | None = None
-) -> Cost:
-    """Return the cost of a scheme from that of a stage, by default fitted to the log's rewards.
-
-    It is the cost of x_N, too, without an action. The constant adds the mean cost of the log beyond
-    the horizon.
-
-    Raises:
-        QPError: as in `fit_rewards`.
-    """
-    gamma = cfg.task.gamma
-    fitted = _fitted(cfg, log, layout) if fitted is None else fitted
-    cost = scheme_cost(fitted.best, layout, gamma, cfg.task.hessian, fitted.shifted)
+def _observed_cost(cfg: DictConfig, start: Start) -> Cost:
+    """Return the cost of a scheme from the start's; the constant has the log's mean after x_N."""
+    gamma, layout, log = cfg.task.gamma, start.layout, start.log
+    diagonal = cfg.task.hessian == "diagonal"
+    fitted = start.cost or fit_rewards(log, layout, diagonal, start.model)
+    cost = scheme_cost(fitted, layout, gamma, cfg.task.hessian)
     if gamma < 1:
         mean = -log["next", "reward"].reshape(log.shape)[valid_steps(log)].double().mean()
-        stages = layout.horizon + (not fitted.shifted)
-        cost = replace(cost, c=cost.c + gamma**stages / (1 - gamma) * mean)
+        cost = replace(cost, c=cost.c + gamma ** (layout.horizon + 1) / (1 - gamma) * mean)
     return cost
 
 
-def nominal_mpcs(
-    cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase], held: Sequence[int] = ()
-) -> list[QPMPC]:
+def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase]) -> list[QPMPC]:
     """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
 
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a
     second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
-    the covariance of the cross-validated prediction errors, so that it holds with a probability of
-    95 %: with the feedback of `back_off` or, for a window, without one.
+    the covariance of the prediction errors, so that it holds with a probability of 95 % with the
+    feedback of `back_off`.
 
     Args:
         cfg: the run's configuration.
         physics: the plant.
         data: logs, each as in `identify`.
-        held: the outputs that the model holds.
 
     Raises:
         QPError: the steps identify no model.
@@ -231,47 +247,22 @@ def nominal_mpcs(
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
     layout, costs = scheme.layout, [scheme.cost]
-    identified = identified_model(data, layout, "tied", held)
+    model, _ = measured_model(data, layout.n_x, layout.n_d)
     if scheme.cost.stage_weight is None:
         diagonal = cfg.task.hessian == "diagonal"
-        start = Start(data, identified, fit := fit_rewards(data, layout, diagonal))
-        costs = [scheme_cost(fit.now, layout, 1.0, cfg.task.hessian)]
-        if not diagonal and layout.past == 1:
+        fit = fit_rewards(data, layout, diagonal, model)
+        costs = [scheme_cost(fit, layout, 1.0, cfg.task.hessian)]
+        if not diagonal:
             with suppress(QPError):
+                start = Start(data, model, layout.horizon, cost=fit)
                 costs.append(regulator_cost(costs[0], start, 1.0))
-    model = Model(*identified.model)
-    schemes = [replace(scheme, model=model, cost=cost, gamma=1.0) for cost in costs]
-    return [_tightened(cfg, scheme, identified) for scheme in schemes]
-
-
-def _tightened(cfg: DictConfig, scheme: Scheme, identified: Identified) -> QPMPC:
-    """Return MPC with the bounds of `nominal_mpcs`."""
-    mpc = QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
-    if not (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
-        return mpc
-    if scheme.layout.past == 1:
-        back_off(mpc, identified.covariance)
-    else:
-        errors = identified.errors
-        errors = errors[errors.isfinite().flatten(1).all(-1)].transpose(0, 1)
-        tighten(mpc, F.pad(errors.mT @ errors / errors.shape[1], (0, 0, 0, 0, 1, 0)))
-    return mpc
-
-
-def identified_model(
-    data: Any,
-    layout: Layout,
-    structure: str,
-    held: Sequence[int],
-    ridge: float | None = None,
-) -> Identified:
-    """Identify C and b with the sizes of ``layout``; see `identify`."""
-    sizes = {"past": layout.past, "n_d": layout.n_d, "n_x": layout.n_x}
-    options = {"structure": structure, "ridge": ridge, "held": held}
-    return identify(data, layout.horizon, **sizes, **options)
-
-
-def _fitted(cfg: DictConfig, log: TensorDictBase, layout: Layout) -> RewardCost:
-    """Fit the costs of a stage; with a tied C or a Riccati weight all stages have the same."""
-    usable = cfg.constraint.structure == "free" and cfg.task.terminal_weight != "riccati"
-    return fit_rewards(log, layout, cfg.task.hessian == "diagonal", after=True, usable=usable)
+    found = _scheme_model(model)
+    schemes = [replace(scheme, model=found, cost=cost, gamma=1.0) for cost in costs]
+    mpcs = [
+        QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
+        for scheme in schemes
+    ]
+    for mpc in mpcs:
+        if (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
+            back_off(mpc, torch.tensor(model.S))
+    return mpcs

@@ -106,9 +106,9 @@ class Task:
 def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
     """Return the sizes of the QP of a plant."""
     if isinstance(plant, Plant):
-        return Layout(plant.n_y, plant.n_u, horizon, plant.past, plant.n_d)
-    past = plant.past if isinstance(plant, GymnasiumPlant) else 1
-    return Layout(len(plant.lb_s), len(plant.lb_a), horizon, past)
+        return Layout(plant.n_x, plant.n_u, horizon, n_d=plant.n_d)
+    n_x = plant.n_x if isinstance(plant, GymnasiumPlant) else len(plant.lb_s)
+    return Layout(n_x, len(plant.lb_a), horizon)
 
 
 def plant_scheme(
