@@ -69,7 +69,7 @@ BUDGET = {
     "analysis": 1203,
     "control": 4087,
     "envs": 1534,
-    "experiment": 3835,
+    "experiment": 3849,
     "export": 1429,
     "learning": 2479,
     "mpc": 5409,

@@ -27,17 +27,19 @@ from torch_qpmpc.experiment.choosing import (
     ESTIMATE,
     FIRST,
     OUTPUTS,
+    below,
     candidates,
     choose,
     chosen_before,
 )
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
-from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start
+from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.choice import STARTS, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import estimated
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc import stage_cost
+from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.riccati import terminal_riccati
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -163,6 +165,26 @@ def test_the_second_log_is_the_policys_with_exploration():
     assert 0.05 < away.std() < 0.3
     assert away.abs().max() < 0.3 + 1e-6
     assert y.square().mean() < 0.7 * log["observation"].square().mean()
+
+
+@pytest.mark.parametrize("episodes", [None, 5])
+def test_a_log_of_ones_own_is_the_first_one(tmp_path, episodes):
+    """It has other episodes, steps and entries than the second, and the run resumes with both."""
+    cfg = make_config(*DATA)
+    physics: Any = make_physics(cfg)
+    own = collect_log(cfg, physics).select("observation", "action", "next")
+    own = own[:1].reshape(-1) if episodes is None else own[:1, :50].reshape(episodes, 10)
+    torch.save(own.exclude(("next", "truncated")).to_dict(), tmp_path / "own.pt")
+    cfg.start.file = str(tmp_path / "own.pt")
+    start = make_start(cfg, physics, tmp_path / "run", written=False)
+    again = make_start(cfg, physics, tmp_path / "run", written=True)
+    assert start is not None
+    assert again is not None
+    assert again.choice == start.choice
+    np.testing.assert_array_equal(again.model.A, start.model.A)
+    logs = below(own, own[..., :-1])
+    assert len(logs) == 2 * (episodes or 1)
+    assert (~valid_steps(logs)).sum() == (episodes or 1)
 
 
 def test_zero_action_is_held_if_nothing_costs_less():

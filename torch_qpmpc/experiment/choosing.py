@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from scipy.special import stdtrit
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, pad
 from torch import Tensor
 from tqdm import tqdm
 
@@ -22,6 +22,7 @@ from torch_qpmpc.experiment.tasks.choice import Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import identify_blended
+from torch_qpmpc.mpc.log import valid_steps
 
 #: Episodes of each start in the first round.
 FEW = 4
@@ -96,7 +97,7 @@ def choose(
         for name in named:
             run(name, few)
         best = min(named, key=lambda name: rows[name].J)
-        log = torch.cat((log, explored(named[best])))
+        log = below(log, explored(named[best]))
         second = candidates(cfg, physics, log)
         named |= second
         for name in second:
@@ -119,12 +120,25 @@ def chosen_before(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase, choic
         QPError: the logs have no such start.
     """
     first = choice.scheme.endswith(FIRST)
-    named = candidates(cfg, physics, log[: len(log) // 2] if first else log)
+    named = candidates(cfg, physics, log[: -cfg.num_envs] if first else log)
     if (start := named.get(choice.scheme.removesuffix(FIRST))) is None:
         raise QPError.expected("starts.csv", f"{choice.scheme!r}", f"one of {', '.join(named)}")
     return start._replace(
         held=_zero(physics) if choice.name == ZERO_ACTION else None, choice=choice
     )
+
+
+def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
+    """Return two logs, ``(T,)`` or ``(episodes, T)``, one below the other; padding is masked.
+
+    Entries that only one has, as in a log of one's own, are left out.
+    """
+    logs = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
+    steps = max(log.shape[1] for log in logs)
+    logs = [log.clone(recurse=False).set("mask", valid_steps(log)) for log in logs]
+    logs = [pad(log, [0, 0, 0, steps - log.shape[1]]) for log in logs]
+    common = set.intersection(*({*log.keys(True, True)} for log in logs))
+    return torch.cat([log.select(*common) for log in logs])
 
 
 def _zero(physics: AnyPlant) -> Tensor:

@@ -90,7 +90,7 @@ class Bounds:
         """
         n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
         if self.rate_bounds is not None and layout.past == 1:
-            remedy = "The window then holds u_{-1}; torch_qpmpc.envs.PastWindow makes it."
+            remedy = "The window then holds u_{-1}."
             raise QPError.expected("rate_bounds", "bounds with past=1", "past >= 2", remedy)
         D = _matching_rows("constraints", self.constraints, n_d + layout.n)
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
