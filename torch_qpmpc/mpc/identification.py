@@ -116,9 +116,10 @@ class Identified:
         rows = [("RMSE of " + ", ".join(map(log.label, log.outputs)), "R2, cross-validated")]
         longest = min(N, max(part.steps for part in log.trajectories))  # single steps have one
         steps = sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < longest} | {longest})
+        rmse, R2 = self.rmse, self.R2
         for k in steps:
-            errors = " ".join(f"{x:.3g}" for x in self.rmse[k - 1].tolist())
-            rows.append((errors, " ".join(f"{x:.3f}" for x in self.R2[k - 1])))
+            errors = " ".join(f"{x:.3g}" for x in rmse[k - 1].tolist())
+            rows.append((errors, " ".join(f"{x:.3f}" for x in R2[k - 1].tolist())))
         width = max(38, *(len(errors) + 2 for errors, _ in rows))
         lines += [
             f"{k:>6}  {errors:{width}}{R2}"

@@ -14,7 +14,7 @@ states. Signals are normalised, so that units decide nothing.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -143,26 +143,34 @@ def held_out_errors(
     for i, part in enumerate(parts):
         others = [one for j, other in enumerate(parts) if j != i for one in other]
         model = fit_state_space(others, order, lags).model
-        for one in part:
-            settled = lags if one.steps > 2 * lags else 0
-            y, u, d = (x.numpy() for x in one)
-            errors.append(model.errors(y, u, d, horizon)[settled:])
+        for e in _errors(model, part, horizon):
+            settled = lags if e.shape[1] > 2 * lags else 0
+            errors.append(e[:, settled:].reshape(-1, *e.shape[2:]))
     return np.concatenate(errors)
 
 
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
-    errors = [
-        model.errors(one.y.numpy(), one.u.numpy(), one.d.numpy(), 1)[:, 0] for one in trajectories
-    ]
-    mean = np.nanmean(np.concatenate(errors), 0)
-    inside = []
+    errors = [e[:, :, 0] for e in _errors(model, trajectories, 1)]
+    whole, inside = np.concatenate([e.reshape(-1, e.shape[-1]) for e in errors]), []
+    mean, variance = np.nanmean(whole, 0), np.nanvar(whole, 0)
     for lag in range(1, CORRELATIONS + 1):
-        pairs = np.concatenate([(e[lag:] - mean) * (e[:-lag] - mean) for e in errors])
+        pairs = [(e[:, lag:] - mean) * (e[:, :-lag] - mean) for e in errors]
+        pairs = np.concatenate([x.reshape(-1, x.shape[-1]) for x in pairs])
         count = np.isfinite(pairs).sum(0)
-        size = np.nanvar(np.concatenate(errors), 0) * 1.96 * np.sqrt(np.maximum(count, 1))
+        size = variance * 1.96 * np.sqrt(np.maximum(count, 1))
         inside.append(np.abs(np.nansum(pairs, 0)) <= size)
     return np.mean(inside, 0)
+
+
+def _errors(
+    model: Innovations, trajectories: Sequence[Trajectory], horizon: int
+) -> Iterator[Array]:
+    """Yield multi-step errors ``(G, T, horizon, n_y)`` of the trajectories of each length."""
+    n_u = model.B.shape[1]
+    data = [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
+    for (y, v), _ in _batches(data):
+        yield model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
 
 
 # The choice
