@@ -44,9 +44,8 @@ def fit_rewards(
     Warns:
         UserWarning: R2 is below 0.9.
     """
-    x, u, following, cost = map(
-        torch.cat, zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    )
+    parts = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
+    x, u, following, cost = map(torch.cat, parts)
     fitted = fit_stage_cost(torch.cat((x, u), -1), cost, layout.n_d, diagonal)
     if model is not None and not diagonal and not layout.n_d:
         after = fit_stage_cost(torch.cat((following, u), -1), cost)
@@ -60,9 +59,7 @@ def fit_rewards(
 def _before(after: StageCost, model: Innovations) -> StageCost:
     """Return the cost of (x_k, u_k) whose (x_{k+1}, u_k) has the cost ``after``, in the mean."""
     (n, n_u), W = model.B.shape, after.W
-    A, B, offset, L, S = (
-        torch.tensor(part) for part in (model.A, model.B, model.offset, model.L, model.S)
-    )
+    A, B, _, offset, _, L, S = (torch.tensor(part) for part in model[:7])
     M = torch.cat((torch.cat((A, B), -1), torch.eye(n + n_u).to(W)[n:]))
     m = torch.nn.functional.pad(offset, (0, n_u))
     noise = (W[:n, :n] * (L @ S @ L.mT)).sum() / 2

@@ -18,8 +18,8 @@ from torch_qpmpc.mpc.ridge import ridge
 STRENGTHS, SHARE = 10.0 ** torch.arange(-32, 0.1, 0.25, dtype=torch.float64), 1e-3
 #: The error, relative to the terms of a row, of a cost that is quadratic up to rounding.
 EXACT = 1e-6
-#: The eigenvalue, relative to its entries, that counts as zero, and the error that this may add.
-ZERO, HARMLESS = 1e-9, 1e-6
+#: The error that the nearest positive semidefinite W may add.
+HARMLESS = 1e-6
 #: The ridge on changes to a positive semidefinite W, relative to the mean square of a column.
 RIDGE = 1e-6
 #: L-BFGS: the smallest eigenvalue that it starts from, its tolerance and its iterations.

@@ -277,18 +277,11 @@ class _Normal:
         """Return the model with outputs that no input moves, as states that stay."""
         n_y, n, count = len(self.apart), len(model.A), int(self.apart.sum())
         n_d = model.B.shape[1] - self.n_u - count
-        outputs = np.argsort(
-            np.concatenate((np.flatnonzero(~self.apart), np.flatnonzero(self.apart)))
-        )
-        hidden = np.arange(n_y - count, n)
-        states = np.concatenate(
-            (np.where(outputs < n_y - count, outputs, outputs + len(hidden)), hidden)
-        )
+        outputs = np.argsort(np.argsort(self.apart, kind="stable"))
+        hidden, joined = np.arange(n_y - count, n), scipy.linalg.block_diag
+        moved = np.where(outputs < n_y - count, outputs, outputs + len(hidden))
+        states = np.concatenate((moved, hidden))
         one, S = np.eye(count), self.changes.T @ self.changes / len(self.changes)
-
-        def joined(M: Array, other: Array) -> Any:
-            return scipy.linalg.block_diag(M, other)
-
         A = joined(model.A, one)
         A[:n, n:] = model.B[:, self.n_u + n_d :]
         B = np.pad(model.B, ((0, count), (0, 0)))[states]
