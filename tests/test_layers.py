@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 3849,
     "export": 1429,
     "learning": 2479,
-    "mpc": 5409,
+    "mpc": 5410,
     "proofs": 998,
     "qp": 5811,
     "study": 613,

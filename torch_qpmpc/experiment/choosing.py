@@ -133,7 +133,7 @@ def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
 
     Entries that only one has, as in a log of one's own, are left out.
     """
-    logs = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
+    logs: list[Any] = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
     steps = max(log.shape[1] for log in logs)
     logs = [log.clone(recurse=False).set("mask", valid_steps(log)) for log in logs]
     logs = [pad(log, [0, 0, 0, steps - log.shape[1]]) for log in logs]

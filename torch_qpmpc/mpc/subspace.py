@@ -278,7 +278,8 @@ class _Normal:
         n_y, n, count = len(self.apart), len(model.A), int(self.apart.sum())
         n_d = model.B.shape[1] - self.n_u - count
         outputs = np.argsort(np.argsort(self.apart, kind="stable"))
-        hidden, joined = np.arange(n_y - count, n), scipy.linalg.block_diag
+        hidden = np.arange(n_y - count, n)
+        joined: Any = scipy.linalg.block_diag
         moved = np.where(outputs < n_y - count, outputs, outputs + len(hidden))
         states = np.concatenate((moved, hidden))
         one, S = np.eye(count), self.changes.T @ self.changes / len(self.changes)
