@@ -65,13 +65,13 @@ LAYERS = {
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
-    ".": 433,
+    ".": 435,
     "analysis": 1203,
     "control": 4087,
     "envs": 1534,
     "experiment": 3849,
     "export": 1429,
-    "learning": 2479,
+    "learning": 2906,
     "mpc": 5410,
     "proofs": 998,
     "qp": 5811,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.learning.closed_loop import improve
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.mpc.blended import identify_blended
@@ -55,6 +56,7 @@ __all__ = [
     "export_c",
     "identify",
     "identify_blended",
+    "improve",
     "load_run",
     "read_log",
     "solve_qp",

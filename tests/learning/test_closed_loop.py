@@ -1,0 +1,182 @@
+"""`improve`: the gradient of closed loops, what it gains, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from torch_qpmpc.envs import PointMass
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.closed_loop import _Loops, simulated_plant, stage_cost
+from torch_qpmpc.mpc.identification import Identified, identify
+
+
+def logged(loops: int = 8, steps: int = 60) -> Identified:
+    """A model of an oscillator whose position alone is measured, with noise."""
+    rng = np.random.default_rng(0)
+    A, B, C = np.array([[0.9, 0.3], [-0.3, 0.9]]), np.array([0.1, 0.5]), np.eye(2)[:1]
+    logs = []
+    for _ in range(loops):
+        x, u, y = rng.normal(size=2), rng.uniform(-1, 1, (steps, 1)), []
+        for k in range(steps + 1):
+            y.append(C @ x + 0.1 * rng.normal(size=len(C)))
+            if k < steps:
+                x = A @ x + B * u[k] + 0.1 * rng.normal(size=2)
+        logs.append({"y": np.array(y), "u": u})
+    return identify(logs, order=2)
+
+
+def controller(found: Identified, **options) -> qm.QPMPC:
+    """An MPC that pays for the output, with a wrong weight of its own."""
+    own = {"stage_weight": torch.diag(torch.tensor([1.0, 0.0, 0.01]).double()), "gamma": 1.0}
+    own |= {"hessian": "block", "action_bounds": ([-0.5], [0.5]), "solver": "daqp"}
+    own |= {"state_bounds": ([-0.2, -np.inf], [np.inf, np.inf]), "structure": "tied"}
+    own |= {"learn": ("H", "H_f", "q", "b", "lb")} | options
+    return qm.QPMPC.of(**{**found.arguments, "horizon": 5, **own})
+
+
+@pytest.fixture(scope="module")
+def found() -> Identified:
+    return logged()
+
+
+def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
+    """It goes through the filter and the QP, and through loops with active and violated bounds."""
+    mpc = controller(found)
+    plant = simulated_plant(found, stage_cost(mpc.scheme), members=3)
+
+    def cost() -> torch.Tensor:
+        seen, costs = _Loops(plant, 6, 1).run(mpc, 12)
+        at_bounds = (seen[..., 2].abs() > 0.4999).double().mean()
+        assert 0.1 < at_bounds < 0.9
+        assert (seen[..., 0] < -0.2).any()
+        return costs.mean()
+
+    cost().backward()
+    for name, leaf in mpc.coordinates().items():
+        if leaf.grad is None:
+            continue
+        direction = torch.randn(leaf.shape, generator=torch.Generator().manual_seed(2)).double()
+        direction = direction.tril() if name in ("H", "H_f") else direction
+        step, ends = 1e-6, []
+        with torch.no_grad():
+            for sign in (1, -1):
+                leaf.add_(sign * step * direction)
+                ends.append(cost())
+                leaf.sub_(sign * step * direction)
+        expected = (ends[0] - ends[1]) / (2 * step)
+        torch.testing.assert_close((leaf.grad * direction).sum(), expected, rtol=1e-4, atol=1e-7)
+
+
+def test_an_identified_plant_has_the_moments_of_its_model(found):
+    """The first outputs and the later innovations have the model's covariances."""
+    model = found.model
+    plant = simulated_plant(found, lambda p, u: p.sum(-1), members=1)
+    rng, zero = torch.Generator().manual_seed(0), torch.zeros(4000, 1).double()
+    s = plant.starts(rng, 4000)
+    first = model.C @ model.P0 @ model.C.T + model.S
+    L = model.gain(model.P0)[0]
+    spread = torch.as_tensor(L @ first @ L.T)
+    torch.testing.assert_close(
+        plant.known(s).T.cov(), spread, rtol=0.2, atol=0.05 * spread.max().item()
+    )
+    torch.testing.assert_close(s[:, :2], plant.known(s))  # the filter's model is the plant's
+    for _ in range(30):
+        before, s = s, plant.step(s, zero, plant.noise(s, plant.draw(rng, 4000)))
+    expected = before[:, :2] @ torch.as_tensor(model.A).T + torch.as_tensor(model.offset)
+    e = (s[:, :2] - expected) @ torch.linalg.pinv(torch.as_tensor(model.L)).T
+    torch.testing.assert_close(e.T.cov(), torch.as_tensor(model.S)[0, 0], rtol=0.1, atol=0.0)
+
+
+def test_improve_lowers_the_cost_of_identified_loops(found):
+    mpc = controller(found)
+    before = {name: x.detach().clone() for name, x in mpc.named_parameters()}
+    report = qm.improve(mpc, found, updates=30, loops=16, steps=40, held_out=64, members=4)
+    assert report.kept
+    assert report.after < 0.9 * report.before
+    assert "kept: cost of a step" in str(report)
+    assert len(report.curve) == 30
+    assert not any(torch.equal(before[name], x) for name, x in mpc.named_parameters())
+    assert mpc.on_failure == "raise"
+
+
+def test_what_is_no_better_leaves_theta_as_it_was():
+    plant = PointMass()
+    weight = torch.tensor([1.0] * 4 + [0.1] * 2)
+    bounds = ([-1.0] * 2, [1.0] * 2)
+    mpc = qm.QPMPC.from_model(plant.A, plant.B, 3, stage_weight=weight, action_bounds=bounds)
+    before = {name: x.clone() for name, x in mpc.named_parameters()}
+    report = qm.improve(mpc, plant, updates=1, loops=2, steps=5, held_out=16, rate=1e-9)
+    assert not report.kept
+    assert "not kept, theta is as before" in str(report)
+    assert all(torch.equal(before[name], x) for name, x in mpc.named_parameters())
+
+
+def test_loops_go_on_where_the_last_window_ended(found):
+    mpc = controller(found)
+    plant = simulated_plant(found, stage_cost(mpc.scheme), members=1)
+    whole, parts = _Loops(plant, 4, 3), _Loops(plant, 4, 3)
+    with torch.no_grad():
+        expected = whole.run(mpc, 10)[1]
+        got = torch.cat([parts.run(mpc, 5)[1] for _ in range(2)])
+    torch.testing.assert_close(got, expected)
+
+
+def test_the_stage_cost_is_the_schemes_with_the_price_of_violations():
+    scheme = qm.Scheme.of(
+        1,
+        1,
+        3,
+        A=[[1.0]],
+        B=[[1.0]],
+        stage_weight=[2.0, 4.0],
+        state_bounds=([-1.0], [1.0]),
+        state_slack=10.0,
+        start={"q": [1.0, 0.0] * 3 + [0.0]},
+    )
+    cost = stage_cost(scheme)(torch.tensor([[3.0]]).double(), torch.tensor([[0.5]]).double())
+    assert cost.item() == pytest.approx(9.0 + 0.5 + 3.0 + 20.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mpc": None}, "mpc: got NoneType, expected a QPMPC"),
+        ({"plant": object()}, "plant: got object, without starts, draw, noise, step, cost"),
+        ({"updates": 0}, "updates: got 0"),
+        ({"loops": 0}, "loops: got 0"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"window": 0}, "window: got 0"),
+        ({"members": 0}, "members: got 0"),
+        ({"held_out": 8}, "held_out: got 8"),
+        ({"rate": 0.0}, "rate: got 0.0"),
+        ({"seed": -1}, "seed: got -1"),
+    ],
+)
+def test_improve_refuses(change, message):
+    plant = PointMass()
+    weight = torch.tensor([1.0] * 4 + [0.1] * 2)
+    mpc = qm.QPMPC.from_model(plant.A, plant.B, 3, stage_weight=weight)
+    with pytest.raises(QPError, match=message):
+        qm.improve(**{"mpc": mpc, "plant": plant, **change})  # pyright: ignore[reportArgumentType]
+
+
+def test_improve_refuses_an_mpc_that_learns_nothing():
+    plant = PointMass()
+    mpc = qm.QPMPC.from_model(plant.A, plant.B, 3, stage_weight=[1.0] * 6, learn=())
+    with pytest.raises(QPError, match="mpc: got one that learns nothing"):
+        qm.improve(mpc, plant)
+
+
+def test_improve_refuses_a_model_with_known_signals():
+    rng = np.random.default_rng(0)
+    u, d, y = rng.uniform(-1, 1, 60), rng.uniform(-1, 1, 60), np.zeros(61)
+    for k in range(60):
+        y[k + 1] = 0.8 * y[k] + 0.5 * u[k] + d[k]
+    table = {"y": y[:-1], "u": u, "load": d}
+    found = identify(qm.read_log(table, outputs=["y"], inputs=["u"], known=["load"]))
+    mpc = qm.QPMPC.of(**{**found.arguments, "horizon": 3}, stage_weight=[1.0, 0.1])
+    with pytest.raises(QPError, match="plant: got a model with load, expected one without known"):
+        qm.improve(mpc, found)

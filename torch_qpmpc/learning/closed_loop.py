@@ -1,0 +1,427 @@
+"""Theta by gradients through closed loops: `improve`.
+
+The mean cost of closed loops of a plant that torch can simulate is a function of theta, and its
+gradient goes through the policy's QP, the plant and the filter, step by step. Agrawal, Barratt,
+Boyd and Stellato (2020, arXiv 1912.09529) tune convex policies by it; Zuliani, Balta and Lygeros
+(2023, arXiv 2312.15521) call it BP-MPC, and prove convergence with conservative Jacobians. Here the
+plant may be a model that a log identified, with its noise and filter.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.learning.gate import FEWEST, PairedTest
+from torch_qpmpc.mpc.identification import Identified
+from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.mpc.log import Trajectory
+from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.parametrizations import Tied
+from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.subspace import fit_state_space
+
+#: The steps of a loop whose gains differ from the last one's, at most.
+STEPS = 1000
+#: The methods that a plant needs.
+METHODS = ("starts", "draw", "noise", "step", "cost")
+#: Models of an ensemble.
+MEMBERS = 8
+
+
+class SimulatedPlant:
+    """Identified models as a plant whose policy sees the estimate of a filter.
+
+    Loop i runs with model i modulo their number. The state is [xi, xi_f, k]: the model's own
+    estimate, which its innovations move, that of the filter, and the step, by which the gains vary.
+    The innovations are drawn from those of the log, scaled to the model's covariance.
+
+    Args:
+        models: the plants.
+        observer: the model of the filter.
+        log: the trajectories with the innovations.
+        cost: maps estimates ``(count, n)`` and actions ``(count, n_u)`` to costs ``(count,)``.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[Innovations],
+        observer: Innovations,
+        log: Sequence[Trajectory],
+        cost: Callable[[Tensor, Tensor], Tensor],
+    ) -> None:
+        self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
+        self._residuals = torch.stack([_residuals(model, log) for model in models])
+        self._n = self._own.A.shape[-1]
+
+    def starts(self, rng: torch.Generator, count: int) -> Tensor:
+        """Draw states ``(count, n_s)`` after the first output."""
+        k = torch.zeros(count, dtype=torch.int64)
+        x = self._own.x0[torch.arange(count) % len(self._own.x0)]
+        seen = self._filter.x0.expand(count, -1)
+        e = torch.randn(count, self._residuals.shape[-1], generator=rng, dtype=x.dtype)
+        return self._measured(x, seen, e, k)
+
+    def known(self, s: Tensor) -> Tensor:
+        """Return what the policy sees, ``(count, n)``."""
+        return s[:, self._n : -1]
+
+    def draw(self, rng: torch.Generator, count: int) -> Tensor:
+        """Draw innovations of unit covariance, ``(count, n_y)``."""
+        models, size = self._residuals.shape[:2]
+        chosen = torch.randint(size, (count,), generator=rng)
+        return self._residuals[torch.arange(count) % models, chosen]
+
+    def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
+        """Return the draw, as innovations are white."""
+        return draw
+
+    def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
+        """Return the next states."""
+        k = s[:, -1].detach().long() + 1
+        x, seen = self._own.moved(s[:, : self._n], a), self._filter.moved(self.known(s), a)
+        return self._measured(x, seen, nu, k)
+
+    def cost(self, s: Tensor, a: Tensor) -> Tensor:
+        """Return the costs of a step, ``(count,)``."""
+        return self._cost(self.known(s), a)
+
+    def _measured(self, x: Tensor, seen: Tensor, nu: Tensor, k: Tensor) -> Tensor:
+        """Return the states after an output, from their predictions."""
+        own, other = self._own, self._filter
+        e = own.at("roots", nu, k)
+        error = own.at("C", x) + e - other.at("C", seen)
+        x, seen = x + own.at("gains", e, k), seen + other.at("gains", error, k)
+        return torch.cat((x, seen, k[:, None].to(x)), -1)
+
+
+class _Course:
+    """Matrices of models, and the gains and the roots of innovations' covariances by step.
+
+    All have as many states and steps as the largest, states that stay zero and steady gains.
+    """
+
+    def __init__(self, models: Sequence[Innovations]) -> None:
+        courses = [_course(model) for model in models]
+        n, steps = (max(len(part[i]) for part in courses) for i in (0, 5))
+        n_y = len(models[0].C)
+
+        def stack(i: int, *shape: int) -> Tensor:
+            whole = np.zeros((len(models), *shape))
+            for to, part in zip(whole, (part[i] for part in courses), strict=True):
+                to[tuple(map(slice, part.shape))] = part
+                if i > 4:
+                    to[len(part) :] = to[len(part) - 1]
+            return torch.as_tensor(whole)
+
+        self.A, self.B = stack(0, n, n), stack(1, n, models[0].B.shape[1])
+        self.offset, self.C, self.x0 = stack(2, n), stack(3, n_y, n), stack(4, n)
+        self.gains, self.roots = stack(5, steps, n, n_y), stack(6, steps, n_y, n_y)
+
+    def at(self, name: str, x: Tensor, k: Tensor | None = None) -> Tensor:
+        """Return the product of each loop's matrix, that of step k, and x ``(count, n)``."""
+        whole = getattr(self, name)
+        one = torch.arange(len(x)) % len(whole)
+        chosen = whole[one] if k is None else whole[one, k.clamp(max=whole.shape[1] - 1)]
+        return (chosen @ x[..., None])[..., 0]
+
+    def moved(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return the predictions of the next states."""
+        offset = self.offset[torch.arange(len(x)) % len(self.offset)]
+        return self.at("A", x) + self.at("B", u) + offset
+
+
+def _course(model: Innovations) -> tuple[np.ndarray, ...]:
+    P, course = model.P0, []
+    for _ in model.gains(STEPS):
+        gain, V, P = model.gain(P)
+        course.append((gain, _root(V)))
+    course.append((model.L, _root(model.S)))
+    gains, roots = map(np.array, zip(*course, strict=True))
+    return model.A, model.B, model.offset, model.C, model.x0, gains, roots
+
+
+def _root(V: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(V)
+    return vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+
+
+def simulated_plant(
+    identified: Identified, cost: Callable, members: int = MEMBERS, seed: int = 0
+) -> SimulatedPlant:
+    """Return the model and those of bootstrapped trajectories as a plant, with its filter."""
+    log, fit = identified.log.trajectories, identified.fit
+    rng, models = np.random.default_rng(seed), [fit.model]
+    for _ in range(members - 1 if len(log) > 1 else 0):
+        again = [log[i] for i in rng.integers(len(log), size=len(log))]
+        models.append(fit_state_space(again, fit.order, fit.lags).model)
+    return SimulatedPlant(models, fit.model, log, cost)
+
+
+def _residuals(model: Innovations, log: Sequence[Trajectory]) -> Tensor:
+    """Return the log's innovations in unit covariance."""
+    errors = [model.errors(x.y.numpy(), x.u.numpy(), x.d.numpy(), 1)[:, 0] for x in log]
+    e = np.concatenate(errors)
+    e = e[np.isfinite(e).all(1)]
+    e = e - e.mean(0)
+    return torch.as_tensor(e @ np.linalg.pinv(_root(e.T @ e / len(e)), 1e-9, True))
+
+
+def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return the cost of (p, u_0) in a scheme's first stage, with the price of its soft bounds."""
+    layout, theta = scheme.layout, scheme.theta
+    kept = torch.cat(
+        (torch.arange(layout.n_d), torch.arange(layout.n_before, layout.n_p + layout.n_u))
+    )
+    blocks = tuple(theta[name] for name in ("H", "H_f") if name in theta)
+    one = torch.ones(layout.n_z, dtype=torch.float64)
+    H, q = layout.hessian(scheme.cost.hessian, blocks, one)[kept][:, kept], theta["q"][kept]
+    G, lb, ub, w = (theta[name] for name in ("G", "lb", "ub", "w"))
+    others = torch.ones(layout.n_z, dtype=torch.bool).index_fill(0, kept, False)
+    rows = w.isfinite() & ~(G[:, others] != 0).any(1)
+    G, lb, ub, w = G[rows][:, kept], lb[rows], ub[rows], w[rows]
+
+    def cost(p: Tensor, u: Tensor) -> Tensor:
+        v = torch.cat((p, u), -1)[:, kept]
+        outside = (lb - v @ G.mT).relu() + (v @ G.mT - ub).relu()
+        return (v @ H * v).sum(-1) / 2 + v @ q + outside @ w
+
+    return cost
+
+
+class _Loops:
+    """Closed loops with a plant, side by side, that can go on."""
+
+    def __init__(self, plant: Any, count: int, seed: int) -> None:
+        self._plant, self._count = plant, count
+        self._rng = torch.Generator().manual_seed(seed)
+        self._known = getattr(plant, "known", lambda s: s)
+        self.start()
+
+    def start(self) -> None:
+        """Begin at new first states."""
+        self._s, self.done = self._plant.starts(self._rng, self._count), 0
+        self._nu = torch.zeros_like(self._s)
+
+    def run(self, mpc: QPMPC, steps: int) -> tuple[Tensor, Tensor]:
+        """Return [p; u] of the next steps ``(steps, count, n_p + n_u)``, and their costs."""
+        plant, s, seen, costs = self._plant, self._s.detach(), [], []
+        qp, active = mpc.quadratic_program(), None
+        for _ in range(steps):
+            p = self._known(s)
+            a, active = mpc.policy_and_active_set(p, active, qp)
+            seen.append(torch.cat((p, a), -1).detach())
+            costs.append(plant.cost(s, a))
+            self._nu = plant.noise(self._nu, plant.draw(self._rng, self._count))
+            s = plant.step(s, a, self._nu)
+        self._s, self.done = s, self.done + steps
+        return torch.stack(seen), torch.stack(costs)
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """The outcome of `improve`; ``print`` shows it.
+
+    Attributes:
+        kept: True if theta has changed.
+        before, after: the mean cost of a step in held-out loops, with the old and the new theta.
+        interval: the 95 % confidence interval of the mean difference.
+        loops, steps: the number of held-out loops, and their length.
+        curve: the mean cost of a step in the loops of each update.
+    """
+
+    kept: bool
+    before: float
+    after: float
+    interval: tuple[float, float]
+    loops: int
+    steps: int
+    curve: list[float]
+
+    def __str__(self) -> str:
+        verdict = "kept" if self.kept else "not kept, theta is as before"
+        low, high = self.interval
+        return (
+            f"{verdict}: cost of a step {self.before:.4g} -> {self.after:.4g} in {self.loops} "
+            f"held-out loops of {self.steps} steps, difference in [{low:.3g}, {high:.3g}] with 95 %"
+        )
+
+
+def improve(
+    mpc: QPMPC,
+    plant: Any,
+    *,
+    updates: int = 100,
+    loops: int = 32,
+    steps: int = 100,
+    window: int | None = None,
+    rate: float = 0.05,
+    held_out: int = 256,
+    members: int = MEMBERS,
+    cost: Callable[[Tensor, Tensor], Tensor] | None = None,
+    penalty: Callable[[QPMPC], Tensor] | None = None,
+    seed: int = 0,
+) -> Improvement:
+    """Move theta along the gradient of the cost of closed loops, and keep it if they cost less.
+
+    The loss is the undiscounted mean cost of a step. Adam moves the learned parts of ``mpc``, each
+    entry in the unit that the signals of its first loops give it, at a rate that falls to zero. The
+    new theta is kept if `PairedTest` finds that it costs less in loops that it has not learned
+    from; otherwise ``mpc`` is as before. A loop in which a QP has no certified solution costs
+    infinitely much, and an update with one is skipped.
+
+    Args:
+        mpc: the policy, with ``learn`` and ``structure`` of its own.
+        plant: an `Identified` model, whose filter's estimate is the QP's state; or a plant with
+            ``starts(rng, count)``, ``draw(rng, count)``, ``noise(nu, draw)``, ``step(s, a, nu)``
+            and ``cost(s, a)`` of a `torch_qpmpc.envs.LinearSystem`, differentiable in s and a. A
+            method ``known(s)`` says what the policy sees, if it is not s.
+        updates: the number of gradients.
+        loops, steps: the number of loops side by side, and their length.
+        window: steps of one gradient, after which the loops go on; ``steps`` by default.
+        rate: the first rate of Adam, in units of the signals.
+        held_out: the number of loops that decide.
+        members: the number of models of an identified plant: the log's, and those of trajectories
+            drawn with replacement. Of a single trajectory there is one.
+        cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
+            plant; by default the `stage_cost` of the scheme.
+        penalty: maps ``mpc`` to a term that is added to the mean cost of a step, such as
+            ``lambda mpc: DeviationPenalty.of(mpc)(mpc.C)``.
+        seed: seeds the models and the loops.
+
+    Raises:
+        QPError: an argument is invalid, or ``mpc`` learns nothing.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> plant, limits = qm.envs.PointMass(), ([-1.0] * 2, [1.0] * 2)
+        >>> weight = torch.tensor([0.1] * 4 + [10.0] * 2)
+        >>> mpc = qm.QPMPC.from_model(
+        ...     plant.A, plant.B, 5, stage_weight=weight, action_bounds=limits, solver="daqp"
+        ... )
+        >>> report = qm.improve(mpc, plant, updates=5, steps=30)
+        >>> report.kept, report.after < report.before
+        (True, True)
+    """
+    check_kind("mpc", mpc, QPMPC)
+    sizes = {"updates": updates, "loops": loops, "steps": steps, "members": members}
+    for name, size in sizes.items():
+        check_whole(name, size, 1)
+    check_whole("held_out", held_out, FEWEST)
+    window = steps if window is None else window
+    check_whole("window", window, 1)
+    check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
+    check_seed(seed)
+    leaves = {k: x for k, x in mpc.coordinates().items() if isinstance(x, nn.Parameter)}
+    if not leaves:
+        remedy = "Name parts of theta in its learn."
+        raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
+    if isinstance(plant, Identified):
+        if known := plant.log.known:
+            got, remedy = (
+                f"a model with {', '.join(known)}",
+                "Simulate them in a plant of your own.",
+            )
+            raise QPError.expected("plant", got, "one without known signals", remedy)
+        plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), members, seed)
+    if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
+        got = f"{type(plant).__name__}, without {', '.join(missing)}"
+        raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")
+    seeds = [int(x) for x in np.random.SeedSequence(seed).generate_state(2)]
+    before, on_failure = copy.deepcopy(mpc.state_dict()), mpc.on_failure
+
+    def tried() -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            seen, costs = _Loops(plant, held_out, seeds[0]).run(mpc, steps)
+        return seen.flatten(0, 1), costs.mean(0)
+
+    mpc.on_failure, curve = "mask", []
+    try:
+        seen, old = tried()
+        theta = _Coordinates(mpc, leaves, seen[seen.isfinite().all(1)], rate, updates)
+        batch = _Loops(plant, loops, seeds[1])
+        for _ in range(updates):
+            mpc.zero_grad()
+            mean = batch.run(mpc, window)[1].mean()
+            curve.append(mean.item())
+            if mean.isfinite():
+                loss = mean if penalty is None else mean + penalty(mpc)
+                (loss / abs(mean.detach())).backward()
+            theta.step()
+            if batch.done >= steps or not mean.isfinite():
+                batch.start()
+        new = tried()[1]
+    finally:
+        mpc.on_failure = on_failure
+        mpc.zero_grad()
+    test = PairedTest()
+    difference = torch.where(old.isfinite(), new - old, -torch.inf)
+    test.add(difference.where(new.isfinite(), torch.inf))
+    kept = test.decision == "better"
+    if not kept:
+        mpc.load_state_dict(before)
+    means = old.mean().item(), new.mean().item()
+    return Improvement(kept, *means, test.interval, held_out, steps, curve)
+
+
+class _Coordinates:
+    """The coordinates of theta, moved by Adam in the units that the signals give them.
+
+    Args:
+        mpc: the QPMPC.
+        leaves: its learned coordinates by name.
+        seen: [p; u] of closed loops, ``(steps, n_p + n_u)``.
+        rate: the first rate, which falls to zero.
+        updates: the number of steps.
+    """
+
+    def __init__(
+        self, mpc: QPMPC, leaves: Mapping[str, Tensor], seen: Tensor, rate: float, updates: int
+    ) -> None:
+        self._mpc, self._leaves = mpc, leaves
+        sizes = seen.square().mean(0).sqrt()
+        x, u, d = sizes[mpc.n_p - mpc.n_x : mpc.n_p], sizes[mpc.n_p :], sizes[: mpc.n_d]
+        z = torch.cat((x, u, d))[mpc.layout.signals()]
+        rows, after = (mpc.G.detach() * z).norm(dim=-1), x.repeat(mpc.horizon)
+        units = {"A": x[:, None] / x, "B": x[:, None] / u, "E": x[:, None] / d}
+        units |= {"C": after[:, None] / z, "b": after, "lb": rows, "ub": rows}
+        units["q"] = mpc.quadratic_program().H.detach().abs() @ z
+        self._units = {name: _unit(mpc, name, x, units.get(name)) for name, x in leaves.items()}
+        self._moves = {name: torch.zeros_like(x) for name, x in leaves.items()}
+        self._adam = torch.optim.Adam(self._moves.values(), lr=rate)
+        self._schedule = torch.optim.lr_scheduler.LinearLR(self._adam, 1.0, 1 / updates, updates)
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move theta along its gradient; one that is not finite moves nothing."""
+        before = {name: move.clone() for name, move in self._moves.items()}
+        for name, move in self._moves.items():
+            gradient = self._leaves[name].grad
+            move.grad = None if gradient is None else gradient * self._units[name]
+        if nn.utils.clip_grad_norm_(self._moves.values(), 1.0).isfinite():
+            self._adam.step()
+        self._schedule.step()
+        for name, leaf in self._leaves.items():
+            leaf.add_(self._units[name] * (self._moves[name] - before[name]))
+        self._mpc.project_()
+
+
+def _unit(mpc: QPMPC, name: str, leaf: Tensor, unit: Tensor | None) -> Tensor:
+    """Return the unit of a coordinate: of a weight's factor its rows, else of other parts."""
+    leaf = leaf.detach()
+    if unit is None:
+        dense = name in ("H", "H_f") and mpc.hessian != "diagonal"
+        unit = leaf.norm(dim=-1, keepdim=True).expand_as(leaf) if dense else leaf.abs()
+    elif unit.shape[-1:] != leaf.shape[-1:]:  # the entries of stages are tied
+        chain: Any = mpc.get_submodule(f"parametrizations.{name}")
+        unit = next(unit[part.first] for part in chain if isinstance(part, Tied))
+    return torch.where(unit.isfinite(), unit, 0.0)
