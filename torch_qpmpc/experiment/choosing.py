@@ -133,12 +133,13 @@ def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
 
     Entries that only one has, as in a log of one's own, are left out.
     """
-    logs: list[Any] = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
+    logs = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
     steps = max(log.shape[1] for log in logs)
     logs = [log.clone(recurse=False).set("mask", valid_steps(log)) for log in logs]
     logs = [pad(log, [0, 0, 0, steps - log.shape[1]]) for log in logs]
     common = set.intersection(*({*log.keys(True, True)} for log in logs))
-    return torch.cat([log.select(*common) for log in logs])
+    both: Any = torch.cat([log.select(*common) for log in logs])
+    return both
 
 
 def _zero(physics: AnyPlant) -> Tensor:
