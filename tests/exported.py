@@ -64,15 +64,16 @@ def tied(horizon: int = 8, **options: Any) -> QPMPC:
 
 
 def rates(horizon: int = 6) -> QPMPC:
-    """Make a scheme with a window of the past and hard limits of the actions' changes."""
+    """Make a scheme with the last action as a state, and hard limits of the actions' changes."""
     return QPMPC.from_model(
-        [[0.9, 0.1, 0.2, 0.0], [0.0, 0.8, 0.0, 0.1]],
-        [[0.1, 0.05], [0.3, 0.1]],
+        [[0.9, 0.1, 0.05], [0.0, 0.8, 0.1], [0.0, 0.0, 0.0]],
+        [[0.1], [0.3], [1.0]],
         horizon,
-        stage_weight=[1.0, 1.0, 0.1],
+        stage_weight=[1.0, 1.0, 0.0, 0.1],
         action_bounds=([-1.0], [1.0]),
-        rate_bounds=([-0.2], [0.2]),
-        state_bounds=([-1.0, -1.0], [1.0, 1.0]),
+        constraints=([[0.0, 0.0, -1.0, 1.0]], [-0.2], [0.2]),
+        constraint_slack=torch.inf,
+        state_bounds=([-1.0, -1.0, -torch.inf], [1.0, 1.0, torch.inf]),
         solver="daqp",
     )
 

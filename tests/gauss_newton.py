@@ -55,7 +55,7 @@ class Reference:
         self.m = (0.9 * self.m).maximum(torch.cat([x.square().nanmean(0) for x in values]))
         stage, d = self.m.split((n, mpc.n_d))
         row = stage[: mpc.n_x].repeat(mpc.horizon)
-        column = torch.cat((d.repeat(mpc.horizon + 1), stage.repeat(mpc.past + mpc.horizon)))
+        column = torch.cat((d.repeat(mpc.horizon + 1), stage.repeat(mpc.horizon + 1)))
         column = column[: mpc.n_z]
         found = [torch.ones_like(leaf).flatten() for leaf in self.leaves]
         if self.mpc.structure == "free":

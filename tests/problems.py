@@ -47,12 +47,11 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
 def model_form(
     A: Tensor, B: Tensor, N: int, offset: Tensor | None = None, E: Tensor | None = None
 ) -> PredictionForm:
-    """Make the prediction form of a model with lags and d, one or one per stage."""
+    """Make the prediction form of a model with d, one or one per stage."""
     n_x, n_d = A.shape[-2], 0 if E is None else E.shape[-1]
-    past = A.shape[-1] // n_x
     b = None if offset is None else -offset.expand(N, n_x).flatten()
     C = banded_matrix(A, B, N, E)
-    return prediction_form(C, n_x, B.shape[-1] // past, b, past, n_d)
+    return prediction_form(C, n_x, B.shape[-1], b, n_d)
 
 
 def predict(form: PredictionForm, p: Tensor, U: Tensor) -> Tensor:

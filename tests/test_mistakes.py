@@ -128,7 +128,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("gamma: got nan, expected a discount factor in (0, 1].", M(gamma=nan)),
     ("A, B: got shapes (2,) and (2, 1), expected matrices (n_x, n_x) and (n_x,", M(A=ones(2))),
     ("A: got a tensor of torch.complex64 on cpu, expected a", M(A=eye(2).to(torch.complex64))),
-    ("A, B: got shapes (2, 2) and (1, 2), expected (n_x, L n_x) and (n_x, L", M(B=ones(1, 2))),
+    ("A, B: got shapes (2, 2) and (1, 2), expected (n_x, n_x) and (n_x, n_u)", M(B=ones(1, 2))),
     ("A: got a tensor of torch.float32 on meta, expected a tensor, or", M(A=eye(2, device="meta"))),
     ("A: got [[1.0, 0.0], [1.0]], expected a tensor, or what", M(A=[[1.0, 0.0], [1.0]])),
     ("A: got a torch.sparse_coo tensor, which is sparse, expected a", M(A=eye(2).to_sparse())),

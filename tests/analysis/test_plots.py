@@ -95,7 +95,7 @@ def test_an_episode_has_a_panel_for_each_signal():
 
 
 def test_plans_are_those_of_the_qp():
-    mpc = QPMPC.of(N_Y, N_U, 3, past=2, n_d=1, solver="daqp")
+    mpc = QPMPC.of(N_Y, N_U, 3, n_d=1, solver="daqp")
     p = normal(T, mpc.n_p)
     plans = plans_along(mpc, p, every=4)
     assert [*plans] == [0, 4]

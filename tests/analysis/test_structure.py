@@ -60,10 +60,10 @@ def free_form(seed: int = 0) -> PredictionForm:
     return form_of(banded_matrix(0.5 * A, B, N) + 0.1 * normal(*C_0.shape, seed=seed))
 
 
-def scheme_with(*past: Tensor) -> Tensor:
+def scheme_with(*earlier: Tensor) -> Tensor:
     """Make C of x_{k+1} = A x_k + B u_k plus terms in (x_j, u_j) for j = k - 1, k - 2, ..."""
     C, n = banded_matrix(0.3 * A, B, N), N_X + N_U
-    for back, block in enumerate(past, start=1):
+    for back, block in enumerate(earlier, start=1):
         for k in range(back, N):
             first = (k - back) * n
             C[k * N_X : (k + 1) * N_X, first : first + n] = block

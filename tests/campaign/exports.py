@@ -101,9 +101,9 @@ def gros_zanon() -> Problem:
 
 
 def rate_limits() -> Problem:
-    """Return the rate limits, whose loop is one of random windows."""
-    known = box([1.2, 1.2, 1.0, 1.2, 1.2])
-    draws = known(np.random.default_rng(1), 1600).reshape(50, 32, 5)
+    """Return the rate limits, whose loop is one of random states."""
+    known = box([1.2, 1.2, 1.0])
+    draws = known(np.random.default_rng(1), 1600).reshape(50, 32, 3)
     return Problem(rates(), known, lambda _: torch.as_tensor(draws))
 
 

@@ -1,4 +1,4 @@
-"""Families of QPs with many known entries: a preview, a window of the past, then the plan.
+"""Families of QPs with many known entries: a preview and a state, then the plan.
 
 The entries d_k of the preview are a price of the actions, a disturbance, and bounds of the outputs.
 """
@@ -27,7 +27,9 @@ def scheme(
     rate_slack: float | None = None,
     **options: Any,
 ) -> QPMPC:
-    """Draw a scheme of any size with a price, a window of the past, and hard bounds of the actions.
+    """Draw a scheme of any size with a price and hard bounds of the actions.
+
+    With bounds of the actions' changes, the last action is the last part of the state.
 
     Args:
         draw: the random numbers.
@@ -36,25 +38,31 @@ def scheme(
         rate_slack: the weight of the bounds of the actions' changes; None without these.
         options: other arguments of `QPMPC`.
     """
-    n_x, n_u, past = draw.randint(1, 2), draw.randint(1, 2), draw.randint(2, 6)
-    horizon = draw.choice([2, 4, 8, 16])
+    n_y, n_u, horizon = draw.randint(1, 4), draw.randint(1, 2), draw.choice([2, 4, 8, 16])
+    last = torch.eye(n_u).double()[:, : 0 if rate_slack is None else n_u]
+    n_x = n_y + last.shape[1]
     one, factor = torch.eye(n_x).double(), draw.normal(n_x + n_u, n_x + n_u)
-    on_d = torch.zeros(2 + n_x, 2 + n_x).double()
+    on_d = torch.zeros(2 + n_y, 2 + n_y).double()
     weight = torch.block_diag(on_d, curvature * factor @ factor.mT)
     weight[0, -n_u:] = weight[-n_u:, 0] = 1.0
+    D = torch.cat((torch.zeros(n_y, 2), -one[:n_y, :n_y], one[:n_y]), -1).repeat(len(sides), 1)
+    lower, upper = ([ENDS[side][i] for side in sides for _ in range(n_y)] for i in range(2))
     if sides:
-        D = torch.cat((torch.zeros(n_x, 2), -one, one), -1).repeat(len(sides), 1)
-        lower, upper = ([ENDS[side][i] for side in sides for _ in one] for i in range(2))
-        with_actions = torch.cat((D, torch.zeros(len(D), n_u)), -1)
-        options["constraints"] = (with_actions, lower, upper)
         options["terminal_constraints"] = (D, lower, upper)
-    if rate_slack is not None:
-        options |= {"rate_bounds": ([-1.0] * n_u, [1.0] * n_u), "rate_slack": rate_slack}
+    changes = torch.cat((torch.zeros(n_u, 2 + 2 * n_y), -last, torch.eye(n_u)), -1)
+    changes, limits = changes[: last.shape[1]], [1.0] * last.shape[1]
+    rows = torch.cat((torch.cat((D, torch.zeros(len(D), n_u)), -1), changes))
+    options["constraints"] = (rows, [*lower, *(-x for x in limits)], [*upper, *limits])
+    price = options.get("constraint_slack", 100.0)
+    on_changes = [rate_slack for _ in limits]
+    options["constraint_slack"] = [price] * len(D) + on_changes + [price] * len(D)
+    A = torch.block_diag(0.8 * torch.eye(n_y).double(), 0 * last.mT @ last)
+    A[:n_y] += 0.1 * draw.normal(n_y, n_x)
     return QPMPC.from_model(
-        torch.cat((0.8 * one, 0.1 * draw.normal(n_x, (past - 1) * n_x)), -1),
-        draw.normal(n_x, past * n_u),
+        A,
+        torch.cat((draw.normal(n_y, n_u), last.mT)),
         horizon,
-        E=draw.normal(n_x, 2 + n_x),
+        E=torch.cat((draw.normal(n_y, 2 + n_y), torch.zeros(n_x - n_y, 2 + n_y).double())),
         hessian="block",
         stage_weight=weight,
         terminal_weight=curvature * one,
@@ -99,8 +107,8 @@ def optimal(draw: Draw, mpc: QPMPC, count: int, H: Tensor | None = None) -> Know
     return KnownQP(qp, z[:, :n_f], value, z, sigma, chi, lam, xi)
 
 
-def preview_and_window(draw: Draw, count: int) -> Case:
-    """A window of the past and a preview, with one-sided rows and limits of rates or without."""
+def previews(draw: Draw, count: int) -> Case:
+    """A preview, with one-sided rows and limits of rates or without."""
     sides, rate_slack = draw.choice(((), *ONE_SIDED)), draw.choice((None, torch.inf))
     return solvable(optimal(draw, scheme(draw, 1.0, sides, rate_slack), count))
 
@@ -131,8 +139,8 @@ def rates_out_of_reach(draw: Draw, count: int) -> Case:
     mpc = scheme(draw, rate_slack=torch.inf)
     known, bounds = optimal(draw, mpc, count), mpc.quadratic_program()
     away = draw.choice([-1.0, 1.0]) * (2 + draw.powers(-3, 2, count, 1))
-    fixed, last = known.fixed.clone(), mpc.n_p - mpc.n_x  # y_0 is after the last action
-    fixed[:, last - mpc.n_u : last] = away
+    fixed = known.fixed.clone()
+    fixed[:, mpc.n_p - mpc.n_u : mpc.n_p] = away  # the last action is the last of the state
     known = replace(changed(known, lb=bounds.lb, ub=bounds.ub), fixed=fixed)
     return Case(known, torch.full((count,), int(Status.INFEASIBLE)))
 
@@ -159,7 +167,7 @@ def indefinite_in_the_plan(draw: Draw, count: int) -> Case:
 
 
 FAMILIES = (
-    preview_and_window,
+    previews,
     one_sided_rows,
     prices,
     rate_limits,

@@ -91,7 +91,7 @@ def run(made: Mapping[str, Callable[[], qm.LinearMPC]], steps: int) -> dict[str,
     """Run a controller of each kind, print its counts, and return the largest differences."""
     differences = {}
     for i, (name, make) in enumerate(made.items()):
-        controller = qm.Controller(make(), window=name == "window")
+        controller = qm.Controller(make())
         differences[name], counts = soak(controller, -(-steps // len(made)), 10, i)
         print(f"{name}: inputs within {differences[name]:.1e}; {dict(counts)}", flush=True)
     return differences

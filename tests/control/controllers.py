@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import qpsolvers
@@ -133,7 +133,7 @@ def matrices(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     return A, np.vstack((np.zeros((n + lags - m, m)), np.eye(m))), np.pad(C, ((0, 0), (0, lags)))
 
 
-def designed(plant: Plant, seed: int, window: bool = False) -> qm.Controller:
+def designed(plant: Plant, seed: int, **options: Any) -> qm.Controller:
     """Return a controller of the plant."""
     rng = np.random.default_rng([seed, 1])
     m = plant.B.shape[1]
@@ -145,4 +145,4 @@ def designed(plant: Plant, seed: int, window: bool = False) -> qm.Controller:
         dR=rng.uniform(0.05, 1, m),
         u_bounds=plant.bounds,
     )
-    return qm.Controller(mpc, window=window)
+    return qm.Controller(mpc, **options)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -79,7 +78,7 @@ def test_signals_go_in_and_out_by_name():
 def test_a_controller_shows_its_design_and_last_input():
     controller = qm.Controller(integrator(inputs=["valve"], outputs=["level"]))
     text = "level by valve; horizon 20; Q [1.0]; R [0.1]; dR [0.1]"
-    assert repr(controller) == f"Controller({text}; filter; u = [0.0])"
+    assert repr(controller) == f"Controller({text}; u = [0.0])"
     assert text in repr(controller.mpc)
 
 
@@ -92,36 +91,6 @@ def test_a_reset_starts_where_the_plant_rests():
     controller.reset()
     assert controller.target is None
     assert np.allclose(controller.step([3.0], [3.0]), [0.0])
-
-
-def test_a_window_determines_the_estimates_and_leaves_no_offset(tmp_path):
-    mpc = qm.LinearMPC(PAIR, 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0))
-    controller = qm.Controller(mpc, window=True)
-    controller.reset(y=[5.0, -5.0])  # another past, forgotten after three steps
-    errors, load, bias = [], np.array([0.2, -0.1]), np.array([0.3, 0.1])
-    x: Any = np.zeros(4)
-    y: Any = None
-    for _ in range(100):
-        y = PAIR[2] @ x + bias
-        u = controller.step(y, [0.5, -0.2])
-        predicted = mpc.design.plant.C @ controller.x + mpc.design.disturbances.C @ controller.w
-        x = PAIR[0] @ x + PAIR[1] @ (u + load)
-        errors.append(np.abs(predicted - PAIR[2] @ x - bias).max())
-    assert min(errors[:2]) > 1
-    assert max(errors[2:]) < 1e-9
-    assert np.abs(y - [0.5, -0.2]).max() < 1e-8
-    controller.save(tmp_path / "c.qpmpc")
-    again = qm.Controller.load(tmp_path / "c.qpmpc")
-    assert np.array_equal(again.observer.L, controller.observer.L)
-    assert np.array_equal(again.step(y), controller.step(y))
-
-
-def test_a_window_that_does_not_determine_the_estimates_is_refused():
-    with pytest.raises(QPError, match=r"^window: got 5 states and disturbances, which no whole nu"):
-        qm.Controller(
-            qm.LinearMPC((np.diag([0.5, 0.6, 0.7]), np.eye(3), np.eye(2, 3) + 0.1), 3, Q=1.0),
-            window=True,
-        )
 
 
 def test_the_filter_is_stable_and_faster_with_more_drift():

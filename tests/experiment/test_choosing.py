@@ -172,8 +172,8 @@ def test_a_log_of_ones_own_is_the_first_one(tmp_path, episodes):
     """It has other episodes, steps and entries than the second, and the run resumes with both."""
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
-    own = collect_log(cfg, physics).select("observation", "action", "next")
-    own = own[:1].reshape(-1) if episodes is None else own[:1, :50].reshape(episodes, 10)
+    whole: Any = collect_log(cfg, physics).select("observation", "action", "next")
+    own = whole[:1].reshape(-1) if episodes is None else whole[:1, :50].reshape(episodes, 10)
     torch.save(own.exclude(("next", "truncated")).to_dict(), tmp_path / "own.pt")
     cfg.start.file = str(tmp_path / "own.pt")
     start = make_start(cfg, physics, tmp_path / "run", written=False)

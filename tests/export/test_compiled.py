@@ -73,7 +73,7 @@ def test_float32_and_a_limit():
 
 @needs_compiler
 def test_unsolved_steps_raise_or_return_an_action_within_bounds():
-    p = torch.tensor([[0.0, 0.0, -3.0, 0.0, 0.0], [torch.nan] * 5, [0.0] * 5])
+    p = torch.tensor([[0.0, 0.0, -3.0], [torch.nan] * 3, [0.0] * 3])
     match = "2 of 3 steps have no certified solution: 1 infeasible, 1 invalid p"
     with pytest.raises(SolverError, match=match):
         CompiledPolicy(rates())(p)
@@ -97,7 +97,7 @@ def test_bad_arguments_are_refused():
 def test_the_value_of_an_unsolved_step_is_inf_as_that_of_the_module():
     mpc = rates()
     mpc.on_failure = "mask"
-    p = torch.tensor([[0.0, 0.0, -3.0, 0.0, 0.0], [torch.nan] * 5, [0.1] * 5])
+    p = torch.tensor([[0.0, 0.0, -3.0], [torch.nan] * 3, [0.1] * 3])
     value = CompiledPolicy(mpc).value(p)
     torch.testing.assert_close(value, mpc.value(p).detach())
     assert value[:2].tolist() == [torch.inf] * 2

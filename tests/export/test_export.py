@@ -85,13 +85,11 @@ def ill_conditioned() -> QPMPC:
 @needs_compiler
 def test_the_head_names_version_date_layout_and_hash(tmp_path):
     mpc = rates()
-    labels = {"x": ["level [m]", "flow [m3/s] */"], "u": ["valve"]}
+    labels = {"x": ["level [m]", "flow [m3/s] */", "last valve"], "u": ["valve"]}
     head = export_c(mpc, tmp_path, labels=labels).files[1].read_text().partition("*/\n")[0]
     today = datetime.date.today().isoformat()
     assert f"torch_qpmpc {qm.__version__} on {today}" in head
-    assert "p[0 .. 1]: x_-1 (level [m], flow [m3/s] * /)" in head
-    assert "p[2]: u_-1 (valve)" in head
-    assert "p[3 .. 4]: x_0" in head
+    assert "p[0 .. 2]: x_0 (level [m], flow [m3/s] * /, last valve)" in head
     assert "u[0]: u_0 (valve)" in head
     same = export_c(mpc, tmp_path / "again", labels=labels)
     assert same.digest in head
@@ -165,21 +163,22 @@ def test_rows_without_a_bound_do_not_make_a_qp_large():
 
 def shifted(**options) -> QPMPC:
     """Make a scheme with two actions in percent, far from 0, and hard limits of their changes."""
-    zeros = torch.zeros(2, 2)
+    one, none = torch.eye(2), torch.zeros(2, 2)
     return QPMPC.from_model(
-        torch.cat((0.9 * torch.eye(2), zeros), 1),
-        torch.cat((0.1 * torch.eye(2), zeros), 1),
+        torch.block_diag(0.9 * one, none),
+        torch.cat((0.1 * one, one)),
         10,
-        stage_weight=[1.0, 1.0, 0.1, 0.1],
+        stage_weight=[1.0, 1.0, 0.0, 0.0, 0.1, 0.1],
         action_bounds=([40.0] * 2, [60.0] * 2),
-        rate_bounds=([-1.0] * 2, [1.0] * 2),
+        constraints=(torch.cat((none, -one, one), 1), [-1.0] * 2, [1.0] * 2),
+        constraint_slack=torch.inf,
         on_failure="mask",
         **options,
     )
 
 
 def test_states_are_drawn_about_a_feasible_one(tmp_path):
-    mpc = shifted(state_bounds=([49.0] * 2, [51.0] * 2))
+    mpc = shifted(state_bounds=([49.0] * 2 + [-torch.inf] * 2, [51.0] * 2 + [torch.inf] * 2))
     tables = make_tables(mpc)
     p, exact = comparison.states(mpc, tables, "float64")
     assert mpc.solve(torch.tensor(tables.centre)).solved

@@ -28,7 +28,7 @@ PARTS = {
     "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
     "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
     "blocks": {"blocks": [1, 2], "learn": ("H", "c", "C")},
-    "prefix": {"past": 2, "n_d": 1, "learn": ("H", "q", "c", "C", "b")},
+    "preview": {"n_d": 1, "learn": ("H", "q", "c", "C", "b")},
 }
 
 

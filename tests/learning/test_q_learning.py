@@ -66,7 +66,7 @@ def test_loss_and_its_gradients(estimator, delay_value):
 
 
 @pytest.mark.parametrize("delay_value", [False, True])
-def test_loss_and_its_gradients_with_a_window_and_a_preview(delay_value):
+def test_loss_and_its_gradients_with_a_preview(delay_value):
     operator = store.make_operator()
     twin = copy.deepcopy(operator.module)
     loss = make_loss(operator=operator, delay_value=delay_value)

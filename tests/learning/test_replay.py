@@ -137,7 +137,7 @@ def test_tau_begins_with_all_that_is_known():
     data = store.collect(4, 30, dtype=torch.float32)
     done = data["next", "done"].squeeze(-1)
     data["collector", "traj_ids"] = done.cumsum(1) - done.long() + 100 * torch.arange(4)[:, None]
-    replay = Replay(4 * 30, 4, 8, 3, 50, n_x=2, preview_key="preview")
+    replay = Replay(4 * 30, 4, 8, 3, 50, preview_key="preview")
     replay.extend(data)
     tau = replay.sample_tau()
     assert tau.shape == (50, store.make_mpc().n_z)

@@ -88,7 +88,7 @@ def test_a_new_network_leaves_the_mpc_as_it_is():
         assert torch.equal(ours(td.clone())[key], other(td.clone())[key])
 
 
-@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
+@pytest.mark.parametrize("known", [{}, {"n_d": 1}], ids=["state", "preview"])
 def test_values_and_policy_are_those_of_the_qp_with_residuals(known):
     mpc, theta, operator = scheduled(known)
     td = transitions(mpc)
@@ -134,7 +134,7 @@ def test_finite_differences_through_theta_keys(output):
     assert (weight.grad * direction).sum().item() == pytest.approx(slope, rel=1e-4)
 
 
-@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
+@pytest.mark.parametrize("known", [{}, {"n_d": 1}], ids=["state", "preview"])
 @pytest.mark.parametrize("delay_value", [False, True])
 def test_q_learning_trains_the_network_and_the_qp(delay_value, known):
     mpc, theta, operator = scheduled(known, moved=False)

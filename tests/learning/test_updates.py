@@ -75,7 +75,7 @@ def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, clip):
 def test_a_preview_and_an_observation_move_theta_as_one_observation_does(second):
     """Also with windows of the SI penalty, in the order of z."""
     batch = store.collect(4, 8)
-    tau = windows_to_tau(batch[:, :3], 2, "preview")
+    tau = windows_to_tau(batch[:, :3], "preview")
     moved = []
     for key in ("preview", None):
         mpc = store.make_mpc()

@@ -1,4 +1,4 @@
-"""One table of QPMPCs: the paper's QP, linear MPC schemes, windows with a preview, and masks."""
+"""One table of QPMPCs: the paper's QP, linear MPC schemes, previews, and masks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ A = torch.tensor([[1.0, 0.2], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.3]]).double()
 W = torch.tensor([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]]).double()
 
-# A window of three outputs, and a preview of a price and a reference
-N, N_X, N_U, N_D, L, GAMMA = 3, 2, 1, 2, 3, 0.9
+# A preview of a price and a reference
+N, N_X, N_U, N_D, GAMMA = 3, 2, 1, 2, 0.9
 n = N_X + N_U
-N_P = (N + 1) * N_D + (L - 1) * n + N_X
-LAST_U = N_P - N_X - N_U  # u_{-1} in p
+N_P = (N + 1) * N_D + N_X
 PRICE, REFERENCE, U = 0, 1, N_D + N_X  # entries of (d_k, x_k, u_k)
-A_L = 0.2 * normal(N_X, L * N_X, seed=1) + 0.5 * torch.eye(N_X, L * N_X)
-B_L, E = 0.5 * normal(N_X, L * N_U, seed=2), 0.3 * normal(N_X, N_D, seed=3)
+A_D = 0.2 * normal(N_X, N_X, seed=1) + 0.5 * torch.eye(N_X)
+B_D, E = 0.5 * normal(N_X, N_U, seed=2), 0.3 * normal(N_X, N_D, seed=3)
 W_D, W_F = torch.zeros(N_D + n, N_D + n).double(), torch.zeros(N_D + N_X, N_D + N_X).double()
 W_D[N_D:, N_D:] = torch.tensor([[1.0, 0.1, 0.0], [0.1, 2.0, 0.1], [0.0, 0.1, 0.5]])
 W_F[N_D:, N_D:] = torch.eye(N_X)
@@ -52,8 +51,8 @@ def linear(seed: int = 0, *, free: float = 0.05, horizon: int = 4, **options: An
     return shifted(QPMPC.linear_mpc(A, B, horizon, **settings), free, seed)
 
 
-def windowed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
-    """Make a QP with past=3 and n_d=2."""
+def previewed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
+    """Make a QP with n_d=2."""
     settings: dict[str, Any] = {
         "E": E,
         "gamma": GAMMA,
@@ -64,7 +63,6 @@ def windowed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
         "terminal_constraints": LAST_ROWS,
         "state_bounds": ([-1.0] * N_X, [1.0] * N_X),
         "action_bounds": ([-0.6], [0.6]),
-        "rate_bounds": ([-0.4], [0.4]),
         "constraint_slack": 2.0,
         "state_slack": 3.0,
         "solver": "daqp",
@@ -75,7 +73,7 @@ def windowed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
         settings |= {"stage_weight": [1.0, 2.0, 0.5], "terminal_weight": [1.0, 1.0]}
     if settings["hessian"] == "full" and "learn" not in options:
         settings["learn"] = [part for part in EVERYTHING if part != "H_f"]
-    return shifted(QPMPC.from_model(A_L, B_L, N, **settings), free, seed)
+    return shifted(QPMPC.from_model(A_D, B_D, N, **settings), free, seed)
 
 
 def rows() -> Tensor:
@@ -111,24 +109,24 @@ LINEAR: dict[str, dict[str, Any]] = {
     "tied, full": {"hessian": "full"},
     "hard rows": {"constraint_slack": torch.inf, "constraints": ([[0.0, 0, 1]], [-0.4], [0.4])},
 }
-WINDOWED: dict[str, dict[str, Any]] = {
-    "window": {},
-    "window, full": {"hessian": "full"},
-    "window, diagonal": {"hessian": "diagonal"},
-    "window, tied": {"structure": "tied"},
-    "window, tied, full": {"structure": "tied", "hessian": "full"},
-    "window, varying": {"structure": "varying"},
-    "window, varying, full": {"structure": "varying", "hessian": "full"},
-    "window, projected": {"structure": "tied", "hessian": "diagonal", "step": "projection"},
-    "window, sdp": {"step": "sdp"},
-    "window, full, projected": {"structure": "varying", "hessian": "full", "step": "projection"},
-    "window, proxqp": {"structure": "tied", "step": "projection", "solver": "proxqp"},
-    "window, torch": {"solver": "torch"},
+PREVIEWED: dict[str, dict[str, Any]] = {
+    "preview": {},
+    "preview, full": {"hessian": "full"},
+    "preview, diagonal": {"hessian": "diagonal"},
+    "preview, tied": {"structure": "tied"},
+    "preview, tied, full": {"structure": "tied", "hessian": "full"},
+    "preview, varying": {"structure": "varying"},
+    "preview, varying, full": {"structure": "varying", "hessian": "full"},
+    "preview, projected": {"structure": "tied", "hessian": "diagonal", "step": "projection"},
+    "preview, sdp": {"step": "sdp"},
+    "preview, full, projected": {"structure": "varying", "hessian": "full", "step": "projection"},
+    "preview, proxqp": {"structure": "tied", "step": "projection", "solver": "proxqp"},
+    "preview, torch": {"solver": "torch"},
 }
 SETTINGS = {
     **{name: (random_mpc, options) for name, options in PAPER.items()},
     **{name: (linear, options) for name, options in LINEAR.items()},
-    **{name: (windowed, options) for name, options in WINDOWED.items()},
+    **{name: (previewed, options) for name, options in PREVIEWED.items()},
 }
 
 
@@ -139,12 +137,10 @@ def made(name: str, seed: int = 0, **changes: Any) -> QPMPC:
 
 
 def inputs(mpc: QPMPC, count: int = 6) -> tuple[Tensor, Tensor]:
-    """Draw p and actions, within the hard bounds of u_0 and of its change."""
+    """Draw p and actions, within the hard bounds of u_0."""
     if mpc.n_p == mpc.n_x:
         return random_states(count), random_states(count, 1, size=0.3)
-    p, share = normal(count, N_P, seed=5), normal(count, 1, seed=6).tanh()
-    p[:, LAST_U] = 0.3 * p[:, LAST_U].tanh()
-    return p, p[:, LAST_U : LAST_U + 1] + 0.15 * share
+    return normal(count, N_P, seed=5), 0.45 * normal(count, 1, seed=6).tanh()
 
 
 def stepped(mpc: QPMPC, rate: float = 1e-3) -> QPMPC:

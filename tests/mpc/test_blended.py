@@ -254,7 +254,7 @@ def test_an_empty_batch_has_no_values(model):
         ),
         (
             lambda log: QPMPC.of(3, 1, N, schedule=qm.identify_blended(log, 3, centres=2)),
-            "schedule: got n_x, n_u, past, n_d = .2, 1, 1, 0., exp.* = .3, 1, 1, 0., as the QPMPC",
+            "schedule: got n_x, n_u, n_d = .2, 1, 0., exp.* = .3, 1, 0., as the QPMPC",
         ),
         (
             lambda _: QPMPC.of(2, 1, N, schedule=1),

@@ -13,17 +13,15 @@ def test_rows_are_hard_or_have_a_price():
         state_bounds=([-1.0, -2.0], [1.0, 2.0]),
         action_bounds=([-3.0], [3.0]),
         constraints=([[1.0, 0.0, 1.0]], [0.0], [4.0]),
-        rate_bounds=([-5.0], [5.0]),
         state_slack=[7.0, torch.inf],
-        rate_slack=8.0,
     )
-    scheme = Scheme(Layout(2, 1, horizon=1, past=2), bounds=bounds)
-    assert (scheme.layout.n_mixed, scheme.layout.n_terminal, scheme.layout.n_rates) == (1, 0, 1)
+    scheme = Scheme(Layout(2, 1, horizon=1), bounds=bounds)
+    assert (scheme.layout.n_mixed, scheme.layout.n_terminal) == (1, 0)
     theta = scheme.theta
-    assert theta["ub"].tolist() == [1, 2, 3, 1, 2, 4, 5]
-    assert theta["lb"].tolist() == [-1, -2, -3, -1, -2, 0, -5]
-    assert theta["w"].tolist() == [7, torch.inf, torch.inf, 7, torch.inf, 100, 8]
-    assert theta["G"][-1].tolist() == [0, 0, -1, 0, 0, 1, 0, 0], "z = [y_-1, u_-1, y_0, u_0, y_1]"
+    assert theta["ub"].tolist() == [1, 2, 3, 1, 2, 4]
+    assert theta["lb"].tolist() == [-1, -2, -3, -1, -2, 0]
+    assert theta["w"].tolist() == [7, torch.inf, torch.inf, 7, torch.inf, 100]
+    assert theta["G"][-1].tolist() == [1, 0, 1, 0, 0], "z = [x_0, u_0, x_1]"
 
 
 def test_each_row_of_D_and_D_f_may_have_its_own_price():

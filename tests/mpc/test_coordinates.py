@@ -25,8 +25,8 @@ KINDS: dict[str, dict[str, Any]] = {
     "free": {},
     "tied": {"structure": "tied", "hessian": "block", **MIXED},
     "varying": {"structure": "varying", **MIXED},
-    "window": {"past": 2, "n_d": 1, "hessian": "block"},
-    "tied window": {"past": 2, "n_d": 1, "structure": "tied", **MIXED_WITH_PREVIEW},
+    "preview": {"n_d": 1, "hessian": "block"},
+    "tied preview": {"n_d": 1, "structure": "tied", **MIXED_WITH_PREVIEW},
     "full": {"hessian": "full"},
     "projected": {"step": "projection", "hessian": "block"},
 }
@@ -101,7 +101,7 @@ def test_residuals_are_added_before_the_parametrisations(structure):
 
 
 @pytest.mark.parametrize("output", ["value", "action value", "policy"])
-@pytest.mark.parametrize("kind", ["free", "tied", "window"])
+@pytest.mark.parametrize("kind", ["free", "tied", "preview"])
 def test_finite_differences_in_every_residual(kind, output):
     mpc = make_mpc(kind)
     mpc.requires_grad_(False)
@@ -144,7 +144,7 @@ def test_bounds_that_residuals_cross_are_invalid_data_of_that_qp_alone():
     assert solution.status.tolist() == [Status.SOLVED, Status.INVALID_DATA, Status.SOLVED]
 
 
-@pytest.mark.parametrize("kind", ["free", "tied window"])
+@pytest.mark.parametrize("kind", ["free", "tied preview"])
 def test_vmap_over_states_and_residuals(kind):
     mpc = make_mpc(kind)
     s, a = inputs(mpc)
@@ -170,7 +170,7 @@ def fresh_dynamo() -> Iterator[None]:
 
 @pytest.mark.usefixtures("fresh_dynamo")
 def test_compiled_in_one_graph_equals_eager():
-    mpc = make_mpc("tied window")
+    mpc = make_mpc("tied preview")
     s, a = inputs(mpc)
     leaves = {name: x.requires_grad_() for name, x in residuals_of(mpc, 0.01, 4).items()}
 

@@ -158,7 +158,6 @@ def test_masks_that_do_not_fit_are_named(options, message):
 
 
 OTHERS = {
-    "past": {"past": 2},
     "n_d": {"n_d": 1},
     "gamma": {"gamma": 0.5},
     "discount_slack": {"discount_slack": True},

@@ -49,22 +49,15 @@ def test_bad_sizes_are_named(sizes, message):
 
 
 def blocked(blocks: list[int], **options: Any) -> QPMPC:
-    """Make a QPMPC of four stages with hard rows of actions, of their changes and of D."""
+    """Make a QPMPC of four stages with hard rows of actions and of D."""
     rows = ([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]], [-0.4, -1.5], [0.3, 1.5])
     settings: dict[str, Any] = {
-        "past": 2,
-        "rate_bounds": ([-0.3], [0.3]),
         "constraints": rows,
         "constraint_slack": [torch.inf, 5.0],
         "learn": ["H", "q", "C", "b", "lb", "ub", "w"],
         "structure": "tied",
     }
     return random_mpc(3, free=0.02, horizon=4, blocks=blocks, **{**settings, **options})
-
-
-def pasts(count: int) -> Tensor:
-    """Draw windows whose last action is small enough for the bounds of changes."""
-    return random_states(count, 5) * torch.tensor([1.0, 1.0, 0.3, 1.0, 1.0])
 
 
 def dense(mpc: QPMPC, s: Tensor, held: list[int]) -> tuple[float, np.ndarray]:
@@ -87,7 +80,7 @@ def dense(mpc: QPMPC, s: Tensor, held: list[int]) -> tuple[float, np.ndarray]:
 )
 def test_the_plan_of_blocks_is_that_of_equal_actions(blocks, held):
     mpc, free = blocked(blocks), blocked([])
-    for s in pasts(6):
+    for s in random_states(6):
         value, u = dense(free, s, held)
         solution = mpc.solve(s)
         assert abs(solution.value.item() - value) < 1e-6 * (1 + abs(value))
@@ -97,8 +90,7 @@ def test_the_plan_of_blocks_is_that_of_equal_actions(blocks, held):
 def test_gradients_of_blocks_pass_finite_differences():
     mpc = blocked([1, 3])
     names, start = zip(*mpc.named_parameters(), strict=True)
-    s, a = pasts(4), 0.05 * random_states(4, 1)
-    s[:, 2] *= 0.5
+    s, a = random_states(4), 0.05 * random_states(4, 1)
 
     def values(*theta: Tensor) -> Tensor:
         named = dict(zip(names, theta, strict=True))
@@ -110,12 +102,12 @@ def test_gradients_of_blocks_pass_finite_differences():
 def test_blocks_leave_fewer_variables_and_rows():
     free, held = (make_tables(blocked(blocks)) for blocks in ([], [1, 3]))
     assert (free.R.shape[1], held.R.shape[1]) == (4, 2)
-    # Bounds, changes and a row of D for each of two stages.
-    assert len(free.rows) - len(held.rows) == 6
+    # Bounds and a row of D for each of two stages.
+    assert len(free.rows) - len(held.rows) == 4
 
 
 def test_residuals_and_copies_keep_blocks(tmp_path):
-    mpc, s = blocked([1, 3]), pasts(3)
+    mpc, s = blocked([1, 3]), random_states(3)
     mpc.save(tmp_path / "mine.qpmpc")
     twin = QPMPC.load(tmp_path / "mine.qpmpc")
     assert torch.equal(twin.value(s), mpc.value(s))

@@ -19,7 +19,6 @@ A, B = torch.eye(2), torch.ones(2, 1)
     [
         (Model(A, B), Layout(2, 1, 5)),
         (Model(A.expand(5, 2, 2), B), Layout(2, 1, 5)),
-        (Model(torch.ones(2, 6), torch.ones(2, 3)), Layout(2, 1, 5, past=3)),
         (Model(A, B, E=torch.ones(2, 4)), Layout(2, 1, 5, n_d=4)),
     ],
 )
@@ -48,9 +47,9 @@ def test_a_discrete_system_of_scipy_has_a_model():
         ({"A": [[1.0, torch.nan], [0, 1]]}, "A: got NaN or inf, expected finite entries"),
         (
             {"A": torch.eye(3)},
-            r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(n_x, L n_x\) and \(n_x, L n",
+            r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(n_x, n_x\) and \(n_x, n_u\)",
         ),
-        ({"A": torch.ones(2, 4)}, r"A, B: got shapes \(2, 4\) and \(2, 1\), expected \(n_x, L n"),
+        ({"A": torch.ones(2, 4)}, r"A, B: got shapes \(2, 4\) and \(2, 1\), expected \(n_x, n_x"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

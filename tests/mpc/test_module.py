@@ -17,33 +17,31 @@ from torch.func import jacfwd, jacrev
 from torch.testing import assert_close
 
 from tests.mpc.settings import (
-    A_L,
-    B_L,
+    A_D,
+    B_D,
     GAMMA,
     LAST_ROWS,
-    LAST_U,
     LINEAR,
     N_D,
     N_P,
     N_U,
     N_X,
+    PREVIEWED,
     ROWS,
     SETTINGS,
     W_D,
     W_F,
-    WINDOWED,
     A,
     B,
     E,
-    L,
     N,
     W,
     inputs,
     linear,
     made,
     n,
+    previewed,
     stepped,
-    windowed,
 )
 from tests.problems import MIXED, normal, random_mpc, random_states, step
 from torch_qpmpc import (
@@ -69,7 +67,7 @@ def test_the_value_is_the_least_action_value_and_that_of_the_policy(name, seed):
     V, Q = mpc(s), mpc(s, a)
     assert torch.equal(V, mpc.value(s))
     assert torch.equal(Q, mpc.action_value(s, a))
-    bound = 1e-7 if name in WINDOWED else 1e-6
+    bound = 1e-7 if name in PREVIEWED else 1e-6
     assert_close(mpc.action_value(s, mpc.policy(s).detach()), V, rtol=bound, atol=bound)
     assert (Q - V).min() > -bound
     assert (Q - V).max() > 1e-3
@@ -99,18 +97,15 @@ def test_without_active_bounds_it_is_the_linear_quadratic_regulator(horizon, n_d
 
 @pytest.mark.parametrize("hessian", ["block", "full"])
 def test_the_plan_follows_the_model_keeps_the_bounds_and_has_its_cost(hessian):
-    mpc = windowed(free=0.0, hessian=hessian)
+    mpc = previewed(free=0.0, hessian=hessian)
     p, _ = inputs(mpc)
     solution = mpc.solve(p)
     x, u = mpc.predicted(solution.z.detach())
-    d, window = p[:, : (N + 1) * N_D].unflatten(-1, (N + 1, N_D)), p[:, (N + 1) * N_D :]
-    pairs = window[:, :-N_X].unflatten(-1, (L - 1, n))
-    past_x, past_u = torch.cat((pairs[..., :N_X], x), 1), torch.cat((pairs[..., N_X:], u), 1)
+    d = p[:, :-N_X].unflatten(-1, (N + 1, N_D))
     cost, slack = torch.zeros(len(p)).double(), torch.zeros(len(p)).double()
     rows, last_rows = (torch.tensor(part[0]).double() for part in (ROWS, LAST_ROWS))
     for k in range(N):
-        lags_x, lags_u = (y[:, k : k + L].flip(1).flatten(1) for y in (past_x, past_u))
-        following = lags_x @ A_L.mT + lags_u @ B_L.mT + d[:, k] @ E.mT
+        following = x[:, k] @ A_D.mT + u[:, k] @ B_D.mT + d[:, k] @ E.mT
         assert_close(x[:, k + 1], following, rtol=0, atol=1e-9)
         stage = torch.cat((d[:, k], x[:, k], u[:, k]), -1)
         cost += 0.5 * GAMMA**k * ((stage @ W_D) * stage).sum(-1)
@@ -121,9 +116,7 @@ def test_the_plan_follows_the_model_keeps_the_bounds_and_has_its_cost(hessian):
     slack += 2.0 * ((last @ last_rows.mT).abs() - 0.4).relu().sum(-1)
     slack += 3.0 * (x.abs() - 1).relu().sum((-1, -2))
     assert_close(solution.value.detach(), cost + slack, rtol=1e-7, atol=1e-7)
-    change = past_u[:, L - 1 :] - past_u[:, L - 2 : -1]
-    assert u.abs().max() < 0.6 + 1e-8
-    assert 0.4 - 1e-6 < change.abs().max() < 0.4 + 1e-8
+    assert 0.6 - 1e-6 < u.abs().max() < 0.6 + 1e-8
 
 
 def test_an_action_beyond_a_hard_bound_is_infeasible():
@@ -133,10 +126,6 @@ def test_an_action_beyond_a_hard_bound_is_infeasible():
     mpc = random_mpc(4, on_failure="mask")
     assert mpc.action_value(s, a).isinf().tolist() == [False, True]
     assert mpc.solve(s, a).status.tolist() == [Status.SOLVED, Status.INFEASIBLE]
-    mpc = windowed(on_failure="mask")
-    p, _ = inputs(mpc)
-    p[2, LAST_U] = 5.0  # no change of the action reaches its bounds
-    assert mpc.value(p).isinf().tolist() == [i == 2 for i in range(6)]
 
 
 # Derivatives
@@ -149,7 +138,7 @@ FUNCTIONS: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
-@pytest.mark.parametrize("name", [*LINEAR, *WINDOWED])
+@pytest.mark.parametrize("name", [*LINEAR, *PREVIEWED])
 def test_gradients_in_theta_and_p_agree_with_differences(name, function):
     if name in LINEAR and function == "solution":
         return
@@ -157,7 +146,7 @@ def test_gradients_in_theta_and_p_agree_with_differences(name, function):
     p, a = inputs(mpc, 6 if name in LINEAR else 4)
     p.requires_grad_()
     FUNCTIONS[function](mpc, p, a).sum().backward()
-    size = 1e-6 if mpc.solver == "daqp" and name in WINDOWED else 1e-5
+    size = 1e-6 if mpc.solver == "daqp" and name in PREVIEWED else 1e-5
     atol = 1e-5 if name in LINEAR else 1e-4
     leaves = (*mpc.named_parameters(), ("p", p))
     assert len(leaves) > len(mpc.learned)
@@ -299,9 +288,9 @@ def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(hessia
 
 
 def test_sizes_and_the_parts_of_z():
-    mpc = windowed()
+    mpc = previewed()
     p, a = inputs(mpc)
-    assert (mpc.past, mpc.n_d, mpc.n_p, mpc.n_z) == (L, N_D, N_P, N_P + N * n)
+    assert (mpc.n_d, mpc.n_p, mpc.n_z) == (N_D, N_P, N_P + N * n)
     assert_close(mpc.solve(p).z[:, :N_P], p)
     assert_close(mpc.solve(p, a).z[:, : N_P + N_U], torch.cat((p, a), -1))
     assert_close(mpc.policy(p), mpc.solve(p).z[:, N_P : N_P + N_U])
@@ -336,12 +325,12 @@ def test_random_starts_are_those_of_the_seed_alone():
 
 
 def test_readable_parts_are_the_model_and_the_rows():
-    mpc = windowed(free=0.0, structure="tied")
+    mpc = previewed(free=0.0, structure="tied")
     parts = mpc.readable()
-    expected = {"A": A_L, "B": B_L, "E": E, "H": W_D, "H_f": W_F, "D": ROWS[0], "D_f": LAST_ROWS[0]}
+    expected = {"A": A_D, "B": B_D, "E": E, "H": W_D, "H_f": W_F, "D": ROWS[0], "D_f": LAST_ROWS[0]}
     for name, value in expected.items():
         assert_close(parts[name], torch.as_tensor(value).double())
-    assert_close(mpc.model(), (A_L, B_L, E))
+    assert_close(mpc.model(), (A_D, B_D, E))
 
 
 # Learning
@@ -411,7 +400,7 @@ def test_no_optimiser_moves_the_bounds_of_hard_rows(structure):
 @pytest.mark.parametrize("step", ["projection", "sdp"])
 @pytest.mark.parametrize("hessian", ["block", "full"])
 def test_a_projection_changes_the_block_of_the_plan_alone(step, hessian):
-    mpc = windowed(free=0.0, step=step, hessian=hessian)
+    mpc = previewed(free=0.0, step=step, hessian=hessian)
     leaf = mpc.leaves("H")[0]
     with torch.no_grad():
         leaf -= 1.5 * torch.eye(leaf.shape[-1])
@@ -537,7 +526,7 @@ def test_twins_give_the_same_answers_and_are_independent(tmp_path, name):
         assert_close(twin.value(s), before, rtol=0, atol=0)
         assert_close(twin.state_dict(), state, rtol=0, atol=0)
         assert (twin.structure, twin.step, twin.learned) == (mpc.structure, mpc.step, mpc.learned)
-        assert (twin.past, twin.n_d, twin.n_p) == (mpc.past, mpc.n_d, mpc.n_p)
+        assert (twin.n_d, twin.n_p) == (mpc.n_d, mpc.n_p)
         stepped(twin, rate=0.01)
         assert (twin.value(s) - before).abs().max() > 1e-6
         twin.reset_parameters()
@@ -574,7 +563,7 @@ def program(H: Tensor, n_known: int) -> QuadraticProgram:
 
 
 def test_an_indefinite_block_of_what_is_known_is_accepted():
-    assert torch.linalg.eigvalsh(windowed(free=0.0).quadratic_program().H)[0] < -1
+    assert torch.linalg.eigvalsh(previewed(free=0.0).quadratic_program().H)[0] < -1
     H = torch.tensor([[-2.0, 1.0], [1.0, 4.0]]).double()
     fixed = torch.tensor([[3.0]]).double()
     solution = solve_qp(program(H, 1), fixed, solver="daqp")
@@ -590,7 +579,7 @@ def test_an_indefinite_block_of_the_plan_is_refused():
         program(H.flip(0, 1), 1)
     with pytest.raises(QPError, match="n_known: got -1, expected a whole number >= 0"):
         program(H, -1)
-    mpc = windowed(step="projection")
+    mpc = previewed(step="projection")
     with torch.no_grad():
         mpc.leaves("H")[0][-1, -1] = -5.0
     with pytest.raises(QPError, match="6 INVALID_DATA"):
@@ -627,22 +616,10 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
             r"stage_weight: got shape \(3, 3, 3\), expected shape \(3, 3\). The Riccati equation",
         ),
         (
-            {"past": 1, "rate_bounds": ([-1.0], [1.0])},
-            r"rate_bounds: got bounds with past=1, expected past >= 2. The window then holds u_",
-        ),
-        (
-            {"past": 2, "rate_slack": 2.0},
-            "rate_slack: got 2.0, expected inf without rate_bounds. It is the price of violating",
-        ),
-        (
-            {"past": 3, "A": torch.eye(2)},
-            r"A, B: got shapes \(2, 2\) and .*, expected \(2, 6\) and \(2, 3\). \[A_1, .., A_L\]",
+            {"A": torch.eye(3)},
+            r"A, B: got shapes \(3, 3\) and \(2, 1\), expected \(2, 2\) and \(2, 1\)",
         ),
         ({"E": B}, r"E: got shape \(2, 1\), expected \(2, 0\). It multiplies the prev"),
-        (
-            {"past": 2, "hessian": "block", "terminal_weight": "riccati"},
-            "terminal_weight: got 'riccati' with past > 1, expected past=1. Pass a matrix",
-        ),
         (
             {"n_d": 2, "hessian": "block", "stage_weight": -W_D},
             "stage_weight: got smallest eigenvalue -2.* expected a positive semidefinite weight",
@@ -666,8 +643,8 @@ def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
 
 
 def test_the_plan_that_is_predicted_has_the_size_of_z():
-    with pytest.raises(QPError, match=r"z: got shape \(6, 16\), expected shape \(\*batch, 25\)"):
-        windowed().predicted(torch.ones(6, N_P))
+    with pytest.raises(QPError, match=r"z: got shape \(6, 10\), expected shape \(\*batch, 19\)"):
+        previewed().predicted(torch.ones(6, N_P))
 
 
 def test_invalid_parameters_are_named():

@@ -16,21 +16,20 @@ FOLDER = Path(__file__).parent
 
 
 def small() -> QPMPC:
-    """Make a QPMPC that has learned, with a window, a preview, masks and soft and hard rows."""
+    """Make a QPMPC that has learned, with a preview, masks and soft and hard rows."""
     torch.manual_seed(0)
     mpc = QPMPC.of(
         1,
         1,
         horizon=2,
-        past=2,
         n_d=1,
-        A=[[0.9, -0.1]],
-        B=[[0.5, 0.1]],
+        A=[[0.9]],
+        B=[[0.5]],
         E=[[0.2]],
         stage_weight=[1.0, 0.1],
         state_bounds=([-1.0], [1.0]),
         action_bounds=([-0.5], [0.5]),
-        learn={"H": True, "c": True, "C": torch.arange(20).reshape(2, 10) % 2 == 0},
+        learn={"H": True, "c": True, "C": torch.arange(16).reshape(2, 8) % 2 == 0},
         solver="daqp",
         on_failure="mask",
     )
@@ -43,8 +42,8 @@ def small() -> QPMPC:
 def test_later_releases_read_the_first_format():
     """``python -m tests.mpc.test_saving`` has written the file."""
     mpc = QPMPC.load(FOLDER / "saved-1.qpmpc")
-    p = np.array([[0.0, 0.1, 0.0, -0.5, 0.1, 0.2], [0.1, 0.2, 0.3, 0.4, -0.2, 0.9]])
-    assert_close(mpc.predict(p), np.array([[-0.313663464725], [-0.5]]), rtol=0, atol=1e-9)
+    p = np.array([[0.0, 0.1, 0.0, 0.2], [0.1, 0.2, 0.3, 0.9]])
+    assert_close(mpc.predict(p), np.array([[-0.248052501107], [-0.5]]), rtol=0, atol=1e-9)
     assert mpc.learned == ("H", "c", "C")
 
 

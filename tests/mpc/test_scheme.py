@@ -50,7 +50,7 @@ def test_a_predictor_takes_the_place_of_the_models_C_and_b():
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_have_the_same_fields_and_theta(copied):
-    for scheme in (make(gamma=0.7, seed=3), Scheme(Layout(2, 1, 3, past=2, n_d=1), seed=4)):
+    for scheme in (make(gamma=0.7, seed=3), Scheme(Layout(2, 1, 3, n_d=1), seed=4)):
         twin = copied(scheme)
         assert (twin.layout, twin.gamma, twin.seed) == (scheme.layout, scheme.gamma, scheme.seed)
         assert twin.is_random == scheme.is_random
@@ -78,9 +78,9 @@ def test_a_step_of_theta_leaves_the_scheme():
 
 
 def test_the_identity_has_the_sizes():
-    message = "state_dict: got a state_dict with past = 2, expected this module's 1"
+    message = "state_dict: got a state_dict with n_d = 2, expected this module's 0"
     with pytest.raises(QPError, match=message):
-        QPMPC.of(2, 1, 3).load_state_dict(QPMPC.of(2, 1, 3, past=2).state_dict())
+        QPMPC.of(2, 1, 3).load_state_dict(QPMPC.of(2, 1, 3, n_d=2).state_dict())
     assert set(asdict(make().layout)) <= identity(QPMPC(make())).keys()
 
 

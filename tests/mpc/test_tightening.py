@@ -62,7 +62,7 @@ def test_rows_hold_with_the_probability():
 
 
 def test_hard_rows_and_known_stages_stay():
-    mpc, loose = scheme(past=1), scheme()
+    mpc, loose = scheme(), scheme()
     covariances = prediction_covariance(A, W, N)
     tighten(mpc, covariances)
     assert torch.equal(mpc.ub[~mpc.soft], loose.ub[~mpc.soft])
@@ -72,10 +72,10 @@ def test_hard_rows_and_known_stages_stay():
     assert_close(loose.ub[x_2] - mpc.ub[x_2], QUANTILE * std)
 
 
-def test_the_first_covariance_is_that_of_the_current_output_behind_a_window_and_a_preview():
-    lags, E = torch.cat((A, 0 * A), -1), torch.ones(2, 1).double()
+def test_the_first_covariance_is_that_of_the_current_output_behind_a_preview():
+    E = torch.ones(2, 1).double()
     bounds = {"state_bounds": ([-2.0, -3.0], [2.0, 3.0]), "stage_weight": [1.0, 1.0, 0.1]}
-    mpc = QPMPC.from_model(lags, torch.cat((B, 0 * B), -1), N, E=E, learn=("H",), **bounds)
+    mpc = QPMPC.from_model(A, B, N, E=E, learn=("H",), **bounds)
     covariances = prediction_covariance(A, W, N, W)
     tighten(mpc, covariances)
     plan = mpc.ub[mpc.soft].unflatten(0, (N + 1, 2))
@@ -135,7 +135,6 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
         (lambda: prediction_covariance(A, W, N, B), "initial: got shape .* expected shape"),
         (lambda: back_off(None, W), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
         (lambda: back_off(scheme(), W), "structure: got 'free'"),
-        (lambda: back_off(QPMPC.of(2, 1, N, past=2), W), "mpc: got past=2, expected past=1"),
         (lambda: back_off(tied(), B), "W: got shape .* expected shape"),
     ],
 )

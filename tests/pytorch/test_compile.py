@@ -48,14 +48,14 @@ def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tenso
     ("name", "known"),
     [
         ("value", "state"),
-        ("action value", "window"),
+        ("action value", "preview"),
         ("policy", "state"),
         ("vmap of action value", "state"),
     ],
 )
 def test_compiled_in_one_graph_equals_eager(name, known):
-    window = {"past": 2, "n_d": 1} if known == "window" else {}
-    mpc, a = random_mpc(3, **window), random_states(4, 1, size=0.4)
+    preview = {"n_d": 1} if known == "preview" else {}
+    mpc, a = random_mpc(3, **preview), random_states(4, 1, size=0.4)
     s = random_states(4, mpc.n_p)
     function = functions(mpc)[name]
     compiled = torch.compile(function, fullgraph=True, backend="aot_eager")

@@ -25,14 +25,7 @@ KINDS = {
     "tied": {"structure": "tied", "learn": ("H", "C", "q", "b", "w")},
     "varying": {"structure": "varying", "learn": ("C", "G"), "discount_slack": True, **MIXED},
     "preview": {"n_d": 2, "hessian": "block"},
-    "window": {
-        "past": 3,
-        "n_d": 1,
-        "structure": "tied",
-        "learn": ("H", "C", "q", "b", "w"),
-        "rate_bounds": ([-0.3], [0.3]),
-        "rate_slack": 2.0,
-    },
+    "tied preview": {"n_d": 1, "structure": "tied", "learn": ("H", "C", "q", "b", "w")},
 }
 kinds = pytest.mark.parametrize("kind", KINDS)
 S, A = random_states(4), random_states(4, 1, size=0.4)
@@ -192,7 +185,7 @@ def test_a_shallow_copy_shares_the_parameters():
     assert_close(twin.value(S), mpc.value(S), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("kind", ["tied", "varying", "window"])
+@pytest.mark.parametrize("kind", ["tied", "varying", "tied preview"])
 def test_a_release_leaves_the_copies_as_they_are(kind):
     mpc = random_mpc(0, **KINDS[kind])
     s = known(mpc)

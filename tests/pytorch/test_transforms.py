@@ -66,7 +66,7 @@ def ensemble(**options: Any) -> tuple[list[QPMPC], dict[str, Tensor]]:
     return mpcs, {name: torch.stack([state[name] for state in states]) for name in states[0]}
 
 
-@pytest.mark.parametrize("known", [{}, {"past": 2, "n_d": 1}], ids=["state", "window"])
+@pytest.mark.parametrize("known", [{}, {"n_d": 1}], ids=["state", "preview"])
 @pytest.mark.parametrize("name", FEATURES)
 def test_vmap_over_theta_and_samples_equals_loops(name, known):
     """Both nestings are batched over theta, over samples, and over both."""

@@ -41,7 +41,7 @@ COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
     """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages.
 
-    Dashed lines end the preview and the window before x_0, where they exist.
+    A dashed line ends the preview.
     """
     image = axes.imshow(
         C.detach().cpu().numpy(),
@@ -57,9 +57,9 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
     stages = range(layout.n_preview or layout.n, layout.n_z, layout.n)
     for column in (*previews, *stages):
         axes.axvline(column - 0.5, color="0.85", linewidth=0.4)
-    _draw_ends(axes, layout)
+    _draw_end(axes, layout)
     axes.set_title(title)
-    plan = (layout.n_before, layout.n, range(mpc.horizon + 1), "x")
+    plan = (layout.n_preview, layout.n, range(mpc.horizon + 1), "x")
     columns = _columns(layout, layout.n_z, plan)
     axes.set_xticks(list(columns), list(columns.values()))
     rows = range(0, mpc.horizon, max(1, mpc.horizon // 5))
@@ -67,23 +67,22 @@ def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
 
 
-def _draw_ends(axes: Axes, layout: Layout) -> None:
-    """Draw the ends of the preview and of the window before x_0, where they exist."""
-    for end in {layout.n_preview, layout.n_before} - {0}:
-        axes.axvline(end - 0.5, color="black", linewidth=0.8, linestyle="--")
+def _draw_end(axes: Axes, layout: Layout) -> None:
+    """Draw the end of the preview."""
+    if layout.n_d:
+        axes.axvline(layout.n_preview - 0.5, color="black", linewidth=0.8, linestyle="--")
 
 
 def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> dict[int, str]:
     """Return the columns that get a tick, with its label, in a figure of ``width`` columns.
 
     Each section, such as the preview, has its first column, the width of a stage, the stages and
-    their letter. Beside a preview or a window, ticks that would overlap are left out.
+    their letter. Beside a preview, ticks that would overlap are left out.
     """
     preview = (0, layout.n_d, range(layout.horizon + 1 if layout.n_d else 0), "d")
-    window = (layout.n_preview, layout.n, range(1 - layout.past, 0), "x")
-    gap = width / 16 if layout.n_before else 0
+    gap = width / 16 if layout.n_d else 0
     ticks = {}
-    for first, size, stages, letter in (preview, window, *plan):
+    for first, size, stages, letter in (preview, *plan):
         step = max(1, layout.horizon // 5, math.ceil(gap / max(size, 1)))
         for stage in stages[::step]:
             ticks[first + (stage - stages[0]) * size] = f"${letter}_{{{stage}}}$"
@@ -94,7 +93,7 @@ def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> 
 def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
     """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap.
 
-    Dashed lines end the preview and the window before x_0, where they exist.
+    A dashed line ends the preview.
     """
     layout = form.layout
     N, n_x, n_u, n_p = layout.horizon, layout.n_x, layout.n_u, layout.n_p
@@ -107,7 +106,7 @@ def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
         aspect="auto",
     )
     axes.axvline(n_p - 0.5, color="black", linewidth=0.8)
-    _draw_ends(axes, layout)
+    _draw_end(axes, layout)
     for k in range(1, N):
         axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
         axes.axvline(n_p + k * n_u - 0.5, color="0.85", linewidth=0.4)
@@ -119,7 +118,7 @@ def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
                 axes.plot([edge, edge + width], [row, row], color="black", linewidth=0.8)
     axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5), title=title)
     shown = range(0, N, max(1, N // 5))
-    x_0, actions = (layout.n_before, n_x, range(1), "x"), (n_p, n_u, range(N), "u")
+    x_0, actions = (layout.n_preview, n_x, range(1), "x"), (n_p, n_u, range(N), "u")
     columns = _columns(layout, entries.shape[1], x_0, actions)
     axes.set_xticks(list(columns), list(columns.values()))
     axes.set_yticks([k * n_x for k in shown], [f"$x_{{{k + 1}}}$" for k in shown])
@@ -132,7 +131,7 @@ def canonical_figure(mpc: QPMPC) -> Figure:
     Raises:
         QPError: if C has no prediction form.
     """
-    start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, past=mpc.past, n_d=mpc.n_d)
+    start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, n_d=mpc.n_d)
     learned = predictions(mpc)
     figure = Figure(figsize=(14, 9), layout="constrained")
     (raw, below), (before, after) = figure.subplots(2, 2)

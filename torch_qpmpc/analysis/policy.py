@@ -1,8 +1,8 @@
 """The policy in terms of control engineering: its gain, and its regions of one active set each.
 
 On each of these regions of the state space the policy is affine in the state. Its slope is the
-gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`). With a window or a preview, the
-state s is all that V fixes, p ``(n_p,)``.
+gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`). With a preview, the state s is
+all that V fixes, p ``(n_p,)``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import as_tensor, ungraded
 from torch_qpmpc.qp.solution import QPSolution
@@ -34,26 +33,6 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
     """
     check_kind("mpc", mpc, QPMPC)
     return _solve_with_gain(mpc, check_tensor("s", ungraded("s", s), mpc.n_p))[1]
-
-
-def window_model(A: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
-    """Return F and G of the next window w+ = F w + G u for a model with lags; A and B for one lag.
-
-    The window is that of p, w = [x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0], ``(n_w,)``; A
-    ``(n_x, L n_x)`` and B ``(n_x, L n_u)`` are as in `banded_matrix`, F ``(n_w, n_w)`` and G
-    ``(n_w, n_u)``.
-
-    Raises:
-        QPError: if the shapes do not fit each other.
-    """
-    check_tensor("A", A, "n_x", "L n_x", batched=False)
-    check_tensor("B", B, "n_x", "L n_u", batched=False)
-    n_x = len(A)
-    following = banded_matrix(A, B.to(A), 1)[:, :-n_x]
-    size, n_u = following.shape[-1], B.shape[-1] // (A.shape[-1] // n_x)
-    shifted = torch.eye(size).to(A)[n_x + n_u :]
-    F, G = torch.cat((shifted, following)).tensor_split((size - n_u,), dim=-1)
-    return F, G
 
 
 def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:
@@ -171,16 +150,13 @@ def policy_map(
 
 
 def _symbol(mpc: QPMPC, i: int) -> str:
-    """Return the symbol of entry i of p: s_1, or one of d_k, x_k and u_k with its stage."""
+    """Return the symbol of entry i of p: s_1, or one of d_k and x_0 with its stage."""
     if mpc.n_p == mpc.n_x:
         return f"s_{{{i + 1}}}"
-    n, n_preview = mpc.n_x + mpc.n_u, (mpc.horizon + 1) * mpc.n_d
-    if i < n_preview:
+    if i < mpc.layout.n_preview:
         stage, entry = divmod(i, mpc.n_d)
         return f"d_{{{stage},{entry + 1}}}"
-    stage, entry = divmod(i - n_preview, n)
-    letter, entry = ("x", entry) if entry < mpc.n_x else ("u", entry - mpc.n_x)
-    return f"{letter}_{{{stage + 1 - mpc.past},{entry + 1}}}"
+    return f"x_{{0,{i - mpc.layout.n_preview + 1}}}"
 
 
 def _solve_with_gain(mpc: QPMPC, s: Tensor) -> tuple[QPSolution, Tensor]:

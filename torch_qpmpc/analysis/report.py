@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from torch_qpmpc.analysis.policy import local_gain, spectral_radius, window_model
+from torch_qpmpc.analysis.policy import local_gain, spectral_radius
 from torch_qpmpc.analysis.structure import (
     NearestModel,
     PredictionForm,
@@ -40,16 +39,15 @@ class StructureReport:
         nearest: the nearest time-invariant scheme (A, B, E, offset).
         stages: the model of each stage (A_k, B_k, E_k, offset_k).
         K: the policy's gain at the state, ``(n_u, n_p)``, u_0 = pi(s) - K ds.
-        K_lqr: the LQR gain of the nearest model and the stage weight, for the window
-            (`window_model`), or None if the Riccati equation has no solution.
+        K_lqr: the LQR gain of the nearest model and the stage weight, ``(n_u, n_x)``; None if the
+            Riccati equation has no solution.
         condition: condition number of C's state columns.
         causality: `causality_defect`.
         toeplitz: `toeplitz_defect`.
-        non_markov: share of the predictions' norm that the latest pair (x_k, u_k), or the latest
-            window, does not explain.
+        non_markov: share of the predictions' norm that the latest pair (x_k, u_k) does not explain.
         distance_to_mpc: relative distance of the predictions to those of ``nearest``.
-        gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||`` with K's part for the window, or nan.
-        radius_predicted: spectral radius of the nearest model's A - B K, or of its window's.
+        gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||`` with K's part for x, or nan.
+        radius_predicted: spectral radius of the nearest model's A - B K.
         radius: spectral radius of the true A - B K; nan without a true model, as are the next.
         model_error: `one_step_error` of ``nearest`` against the true model, with (s, a) of unit
             variance.
@@ -99,7 +97,7 @@ def read(
 
     Args:
         mpc: the QP.
-        true_model: the plant's A and B, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, and, if it has them,
+        true_model: the plant's A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, and, if it has them,
             offset and E ``(n_x, n_d)``; None if they are unknown.
         at: the state of the policy's gain, ``(n_p,)``; the origin by default.
 
@@ -125,19 +123,17 @@ def read(
     energies = form.maps[1:, :, :-1].square().sum((-1, -2))
     left = (stages.residual.square() * energies).sum() / energies.sum()
     K = local_gain(mpc, form.Phi.new_zeros(mpc.n_p) if at is None else at.to(form.Phi))
-    K_window = K[:, form.layout.n_preview :]
-    window = window_model(nearest.A, nearest.B)
-    before = K_window.shape[-1] - mpc.n_x
+    K_x = K[:, form.layout.n_preview :]
     try:
-        K_lqr = lqr_gain(*window, F.pad(stage_weight(mpc), (before, 0, before, 0)), mpc.gamma)
+        K_lqr = lqr_gain(nearest.A, nearest.B, stage_weight(mpc), mpc.gamma)
     except QPError:
         K_lqr = None
     radius = error = largest = first = gain_error = math.nan
     if K_lqr is not None:
-        gain_error = ((K_window - K_lqr).norm() / K_lqr.norm()).item()
+        gain_error = ((K_x - K_lqr).norm() / K_lqr.norm()).item()
     if true is not None:
         A, B, offset, E = true
-        radius = spectral_radius(*window_model(A, B), K_window).item()
+        radius = spectral_radius(A, B, K_x).item()
         error = one_step_error(nearest, A, B, offset, E=E).item()
         pairs = ((nearest.A, A), (nearest.B, B), (nearest.E, E))
         largest = max((own - part).abs().max().item() for own, part in pairs if part.numel())
@@ -154,7 +150,7 @@ def read(
         non_markov=left.sqrt().item(),
         distance_to_mpc=nearest.residual.item(),
         gain_to_lqr=gain_error,
-        radius_predicted=spectral_radius(*window, K_window).item(),
+        radius_predicted=spectral_radius(nearest.A, nearest.B, K_x).item(),
         radius=radius,
         model_error=error,
         model_error_max=largest,
@@ -196,8 +192,8 @@ def _checked_model(mpc: QPMPC, true_model: Sequence[Tensor]) -> TrueModel:
         got += f" of {len(true_model)}" if isinstance(true_model, tuple | list) else ""
         want = "the pair (A, B), (A, B, offset) or (A, B, offset, E)"
         raise QPError.expected("true_model", got, want)
-    n_x, n_u, L = mpc.n_x, mpc.n_u, mpc.past
-    shapes = ((n_x, L * n_x), (n_x, L * n_u), (n_x,), (n_x, mpc.n_d))
+    n_x, n_u = mpc.n_x, mpc.n_u
+    shapes = ((n_x, n_x), (n_x, n_u), (n_x,), (n_x, mpc.n_d))
     for name, part, shape in zip(names, true_model, shapes, strict=False):
         check_tensor(f"true_model's {name}", part, *shape, batched=False)
     zeros = [torch.zeros(shape) for shape in shapes[len(true_model) :]]

@@ -5,11 +5,10 @@ C mean little. Independent of T is the *prediction form*,
 
     X = Phi p + Gamma U + phi,    X = [x_1, .., x_N],    U = [u_0, .., u_{N-1}],
 
-and all that follows from it. p is what V fixes: x_0 or, with a window and a preview, all of z up to
-x_0 (see `torch_qpmpc.mpc.layout`); the *window at k* is then (x_{k+1-L}, u_{k+1-L}, .., x_k, u_k)
-and d_k, and without them (x_k, u_k). The *canonical matrix* is the T C whose row block k reads
-``x_{k+1} = A_k x_k + ..``, as in an MPC scheme: for such a scheme it is C_0 (eq:cband). Norms are
-Frobenius norms of the maps from (p, U) to the states, in the QP's units.
+and all that follows from it. p is what V fixes: x_0 or, with a preview, all of z up to x_0 (see
+`torch_qpmpc.mpc.layout`). The *canonical matrix* is the T C whose row block k reads ``x_{k+1} = A_k
+x_k + ..``, as in an MPC scheme: for such a scheme it is C_0 (eq:cband). Norms are Frobenius norms
+of the maps from (p, U) to the states, in the QP's units.
 """
 
 from __future__ import annotations
@@ -83,13 +82,13 @@ def _check_form(form: PredictionForm) -> None:
 
 
 def prediction_form(
-    C: Tensor, n_x: int, n_u: int, b: Tensor | None = None, past: int = 1, n_d: int = 0
+    C: Tensor, n_x: int, n_u: int, b: Tensor | None = None, n_d: int = 0
 ) -> PredictionForm:
     """Solve ``C z = b`` for x_1, .., x_N.
 
     Args:
-        C: ``(*batch, N n_x, n_z)``; n_z is N (n_x + n_u) + n_x without a window and a preview.
-        n_x, n_u, past, n_d: numbers of states, actions, lags L and entries of d_k, as in `QPMPC`.
+        C: ``(*batch, N n_x, n_z)``; n_z is N (n_x + n_u) + n_x without a preview.
+        n_x, n_u, n_d: numbers of states, actions and entries of d_k, as in `QPMPC`.
         b: ``(*batch, N n_x)``; zero by default.
 
     Raises:
@@ -109,12 +108,11 @@ def prediction_form(
     """
     check_whole("n_x", n_x, 1)
     check_whole("n_u", n_u, 1)
-    check_whole("past", past, 1)
     check_whole("n_d", n_d, 0)
     check_tensor("C", C, "N n_x", "n_z", remedy="Pass mpc.C.")
     n_c, n_z = C.shape[-2:]
     N = n_c // n_x
-    layout = Layout(n_x, n_u, max(N, 1), past, n_d)
+    layout = Layout(n_x, n_u, max(N, 1), n_d)
     if N < 1 or n_c != N * n_x or n_z != layout.n_z:
         want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")
@@ -138,7 +136,7 @@ def predictions(mpc: QPMPC) -> PredictionForm:
     Raises:
         QPError: if C has no prediction form.
     """
-    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.past, mpc.n_d)
+    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.n_d)
 
 
 def canonical(mpc: QPMPC) -> Tensor:
@@ -154,13 +152,13 @@ def canonical(mpc: QPMPC) -> Tensor:
 def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
 
-    From each row block of ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted; with a
-    window, each lag of A_k times its block. For an MPC scheme only the band remains, C_0. In
-    general, a row's other entries are what the window at k does not explain.
+    From each row block of ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted. For an
+    MPC scheme only the band remains, C_0. In general, a row's other entries are what x_k, u_k and
+    d_k do not explain.
 
     Args:
         form: the prediction form of the constraints.
-        A: ``(N, n_x, L n_x)``, such as ``stage_models(form).A``.
+        A: ``(N, n_x, n_x)``, such as ``stage_models(form).A``.
 
     Returns:
         C ``(N n_x, n_z)`` and b ``(N n_x,)``.
@@ -169,8 +167,8 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
         QPError: if ``form`` has batch dimensions, or the shape of A does not fit.
     """
     _check_form(form)
-    n_x, N, past = form.layout.n_x, form.layout.horizon, form.layout.past
-    check_tensor("A", A, N, n_x, past * n_x, batched=False, remedy="Pass stage_models(form).A.")
+    n_x, N = form.layout.n_x, form.layout.horizon
+    check_tensor("A", A, N, n_x, n_x, batched=False, remedy="Pass stage_models(form).A.")
     A = A.to(form.Phi)
     F = form.Phi.new_zeros(N * n_x, form.layout.n_z)
     following, p, u = _columns(form.layout)
@@ -178,8 +176,7 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     F[:, following] = -torch.eye(N * n_x).to(F)
     rows = torch.cat((F, -form.phi.unsqueeze(-1)), dim=-1).unflatten(0, (N, n_x))
     canonical = rows.clone()
-    for lag, A_lag in enumerate(A.split(n_x, dim=-1), start=1):
-        canonical[lag:] -= A_lag[lag:] @ rows[:-lag]
+    canonical[1:] -= A[1:] @ rows[:-1]
     canonical = canonical.flatten(0, 1)
     return canonical[:, :-1], canonical[:, -1]
 
@@ -238,14 +235,10 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class NearestModel:
-    """A model x+ = A x + B u + offset that is read from the constraints.
-
-    With a window of L and a preview it is ``x+ = A [x_k; ..; x_{k+1-L}] + B [u_k; ..; u_{k+1-L}] +
-    E d_k + offset``.
+    """A model x+ = A x + B u + E d + offset that is read from the constraints.
 
     Attributes:
-        A, B, E: ``(n_x, L n_x)``, ``(n_x, L n_u)`` and ``(n_x, n_d)``; with a leading N, one per
-            stage.
+        A, B, E: ``(n_x, n_x)``, ``(n_x, n_u)`` and ``(n_x, n_d)``; with a leading N, one per stage.
         offset: ``(n_x,)``, likewise.
         residual: share of the predictions' norm that the model does not explain, ``()`` or
             ``(N,)``.
@@ -261,14 +254,14 @@ class NearestModel:
 def stage_models(form: PredictionForm) -> NearestModel:
     """Fit the model A_k, B_k of each step of the predictions, from stage k to k + 1.
 
-    A_k, B_k, E_k and the offset are the least-squares fit of the map of x_{k+1} by those of the
-    window at k and a constant, zero in directions that no prediction of x_k reaches. The residual
+    A_k, B_k, E_k and the offset are the least-squares fit of the map of x_{k+1} by those of x_k,
+    u_k, d_k and a constant, zero in directions that no prediction of x_k reaches. The residual
     is the part of x_{k+1} from earlier pairs or later actions: zero in all stages means Markovian.
     """
     _check_form(form)
-    maps, windows = form.maps, _windows(form)
-    fit = _fit(windows, maps[1:])
-    left = maps[1:] - fit @ windows
+    maps, pairs = form.maps, _pairs(form)
+    fit = _fit(pairs, maps[1:])
+    left = maps[1:] - fit @ pairs
     residual = (left.square().sum((-1, -2)) / _without_offset(maps[1:])).sqrt()
     return NearestModel(*_split(fit, form), residual)
 
@@ -282,36 +275,30 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     distance to the MPC schemes.
     """
     _check_form(form)
-    maps, past = form.maps, form.layout.past
+    maps, pairs = form.maps, _pairs(form)
     n_x, n_v = maps.shape[-2:]
-    windows = _windows(form)
-    states, inputs = windows.tensor_split((past * n_x,), dim=1)
-    pooled = windows.movedim(0, 1).flatten(1)
+    pooled = pairs.movedim(0, 1).flatten(1)
     start = _fit(pooled, maps[1:].movedim(0, 1).flatten(1))
     shape = start.shape
 
     def rollout(theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the maps of the windows and of x_1, .., x_N that theta predicts."""
-        x, lagged = [*states[0].split(n_x)[::-1]], []
-        for rest in inputs:
-            lagged.append(torch.cat((*x[: -past - 1 : -1], rest)))
-            x.append(theta @ lagged[-1])
-        return torch.stack(lagged), torch.stack(x[past:])
+        """Return the maps of the pairs and of x_1, .., x_N that theta predicts."""
+        x, predicted = [maps[0]], []
+        for inputs in pairs[:, n_x:]:
+            predicted.append(torch.cat((x[-1], inputs)))
+            x.append(theta @ predicted[-1])
+        return torch.stack(predicted), torch.stack(x[1:])
 
     def residuals(flat):
         return (rollout(torch.as_tensor(flat).view(shape))[1] - maps[1:]).flatten().numpy()
 
     def jacobian(flat):
         theta = torch.as_tensor(flat).view(shape)
-        lags = theta[:, : past * n_x].split(n_x, dim=1)
-        unit = torch.eye(n_x).to(maps)
-        slopes = [maps.new_zeros(*shape, n_x, n_v)] * past
-        for window in rollout(theta)[0]:
-            slope = torch.einsum("pi,qv->pqiv", unit, window)
-            for lag, A in enumerate(lags, start=1):
-                slope = slope + A @ slopes[-lag]
-            slopes.append(slope)
-        return torch.stack(slopes[past:], dim=2).flatten(2).flatten(0, 1).mT.numpy()
+        unit, slopes = torch.eye(n_x).to(maps), [maps.new_zeros(*shape, n_x, n_v)]
+        for pair in rollout(theta)[0]:
+            slope = torch.einsum("pi,qv->pqiv", unit, pair)
+            slopes.append(slope + theta[:, :n_x] @ slopes[-1])
+        return torch.stack(slopes[1:], dim=2).flatten(2).flatten(0, 1).mT.numpy()
 
     # The predictions of an unstable fit may be far off or overflow: then zero is a better start.
     candidates = [np.zeros(start.numel()), start.flatten().numpy()]
@@ -325,21 +312,13 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     return NearestModel(*_split(theta, form), float(np.linalg.norm(residuals(begin))) / scale)
 
 
-def _windows(form: PredictionForm) -> Tensor:
-    """Return [x_k, .., x_{k+1-L}, u_k, .., u_{k+1-L}, d_k, 1] as maps of (p, U, 1), k < N.
-
-    Returns:
-        ``(N, L (n_x + n_u) + n_d + 1, n_v)``.
-    """
+def _pairs(form: PredictionForm) -> Tensor:
+    """Return [x_k, u_k, d_k, 1] as maps of (p, U, 1), k < N, ``(N, n_x + n_u + n_d + 1, n_v)``."""
     maps, layout, N = form.maps, form.layout, form.layout.horizon
     unit = torch.eye(maps.shape[-1]).to(maps)
     d = unit[: layout.n_preview].unflatten(0, (N + 1, layout.n_d))[:N]
-    past = unit[layout.n_preview : layout.n_before].unflatten(0, (layout.past - 1, layout.n))
-    x = torch.cat((past[:, : layout.n_x], maps[:-1]))
-    u = torch.cat((past[:, layout.n_x :], unit[layout.n_p : -1].unflatten(0, (N, layout.n_u))))
-    first = range(layout.past - 1, -1, -1)  # that of x_k, .., x_{k+1-L} for k = 0
-    lags = [part[i : i + N] for part in (x, u) for i in first]
-    return torch.cat((*lags, d, unit[-1:].expand(N, 1, -1)), dim=-2)
+    u = unit[layout.n_p : -1].unflatten(0, (N, layout.n_u))
+    return torch.cat((maps[:-1], u, d, unit[-1:].expand(N, 1, -1)), dim=-2)
 
 
 def _fit(regressors: Tensor, target: Tensor) -> Tensor:
@@ -350,8 +329,7 @@ def _fit(regressors: Tensor, target: Tensor) -> Tensor:
 
 def _split(fit: Tensor, form: PredictionForm) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return A, B, E and the offset of a fit."""
-    past = form.layout.past
-    sizes = (past * form.layout.n_x, past * form.layout.n_u, form.layout.n_d, 1)
+    sizes = (form.layout.n_x, form.layout.n_u, form.layout.n_d, 1)
     A, B, E, offset = fit.split(sizes, dim=-1)
     return A, B, E, offset.squeeze(-1)
 
@@ -365,14 +343,14 @@ def second_moment(s: Tensor, a: Tensor, d: Tensor | None = None) -> Tensor:
     """Return E[v v'] ``(n_v, n_v)`` of v = (s, a, d, 1) over samples ``(*batch, n)``.
 
     Args:
-        s, a: states and actions; with a window [x_k, .., x_{k+1-L}] and [u_k, .., u_{k+1-L}].
+        s, a: states and actions.
         d: the known signals d_k; None without a preview.
 
     Raises:
         QPError: if s, a and d differ in their numbers of samples, or have none.
     """
-    check_tensor("s", s, "L n_x")
-    check_tensor("a", a, "L n_u")
+    check_tensor("s", s, "n_x")
+    check_tensor("a", a, "n_u")
     d = a[..., :0] if d is None else check_tensor("d", d, "n_d")
     if not (s.shape[:-1] == a.shape[:-1] == d.shape[:-1] and s.shape[:-1].numel()):
         got = f"shapes {tuple(s.shape)}, {tuple(a.shape)} and {tuple(d.shape)}"
@@ -394,7 +372,7 @@ def one_step_error(
 
     Args:
         model: the model, with tensors ``(*batch, ..)``, such as one per stage.
-        A, B: the true model, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, as in `NearestModel`.
+        A, B: the true model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
         offset: the true offset, the mean of the noise, ``(n_x,)``; zero by default.
         moment: `second_moment` of the distribution; by default independent entries with mean 0 and
             variance 1, for which the error is the Frobenius norm of the difference.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_flag, check_kind
+from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.exporting import ControllerExport, export_controller
 from torch_qpmpc.control.law import Law, Memory, Outcome
 from torch_qpmpc.control.learning import LearningReport, learn
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
 #: The options of a controller that a file holds.
-OPTIONS = ("noise", "drift", "window")
+OPTIONS = ("noise", "drift")
 
 
 class Controller:
@@ -47,9 +47,6 @@ class Controller:
             identified noise. Without one, a tenth of half the distance of the bounds of the output
             or the input. A larger ratio of drift to noise rejects disturbances faster and passes on
             more noise.
-        window: True replaces the filter by estimates from the last few outputs and inputs alone, as
-            in an identification: the fastest, and the noisiest. Call `reset` with y and u of the
-            plant at rest, or the first steps' estimates are wild.
 
     Attributes:
         mpc: the MPC.
@@ -78,12 +75,9 @@ class Controller:
         [1.]
     """
 
-    def __init__(
-        self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None, window: bool = False
-    ) -> None:
-        check_flag("window", window)
+    def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
-        self._law = Law.of(mpc, noise, drift, window)
+        self._law = Law.of(mpc, noise, drift)
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
@@ -119,9 +113,8 @@ class Controller:
         self.p = torch.zeros(self.mpc.n_p)
 
     def __repr__(self) -> str:
-        """Return its design, its estimator and the last input."""
-        estimator = "window" if self._law.window else "filter"
-        return f"Controller({self.mpc.design}; {estimator}; u = {self.u.round(4).tolist()})"
+        """Return its design and the last input."""
+        return f"Controller({self.mpc.design}; u = {self.u.round(4).tolist()})"
 
     @property
     def mpc(self) -> LinearMPC:
@@ -309,8 +302,7 @@ class Controller:
         start where the last `reset` rests; with a log's model, at rest in the middle of the
         set-points; with an environment, where its own reset says. The filter takes a start that is
         not at rest for a disturbance, until it has settled: the old model and the new one pay for
-        it on the same starts. With ``window=True`` that takes a few steps. On a terminal a bar
-        shows the progress.
+        it on the same starts. On a terminal a bar shows the progress.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed

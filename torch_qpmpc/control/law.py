@@ -20,7 +20,6 @@ from torch_qpmpc.control.observer import (
     floored,
     kalman,
     max_plausible,
-    windowed,
 )
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
 from torch_qpmpc.errors import QPError, SolverError
@@ -91,7 +90,6 @@ class Law:
     Attributes:
         mpc: the MPC.
         noise, drift: standard deviations, ``(n_y,)`` and ``(n_w,)``.
-        window: True if the observer is `windowed`.
         observer: the observer.
         max_plausible: the largest sizes of outputs and set-points, and of known signals.
         qp: the plan's QP.
@@ -100,13 +98,12 @@ class Law:
     mpc: LinearMPC
     noise: Array
     drift: Array
-    window: bool
     observer: Observer
     max_plausible: tuple[Array, Array]
     qp: QuadraticProgram
 
     @classmethod
-    def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None, window: bool = False) -> Law:
+    def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None) -> Law:
         """Return the law of an MPC with today's theta.
 
         Raises:
@@ -122,9 +119,7 @@ class Law:
         drift = _deviations("drift", drift, drifts * design.of_w(design.usual), w.names)
         observer = kalman(design, noise, drift)
         largest = max_plausible(design, noise)
-        if window:
-            observer = windowed(observer)
-        return cls(mpc, noise, drift, window, observer, largest, mpc.quadratic_program())
+        return cls(mpc, noise, drift, observer, largest, mpc.quadratic_program())
 
     @property
     def design(self) -> Design:

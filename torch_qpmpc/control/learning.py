@@ -240,7 +240,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC(lowered(design), **{name: law.mpc.arguments[name] for name in KEYWORDS})
     drift = law.drift if w.names == old.disturbances.names else None
-    return Law.of(mpc, law.noise, drift, law.window)
+    return Law.of(mpc, law.noise, drift)
 
 
 def _compare(

@@ -71,7 +71,7 @@ def lowered(design: Design) -> LinearScheme:
     places = design.places
     n_d = places["known"].stop
     n_x, n_u = places["u"].start - n_d, design.plant.sizes[1]
-    layout = Layout(n_x, n_u, design.horizon, 1, n_d, blocks=design.blocks)
+    layout = Layout(n_x, n_u, design.horizon, n_d, blocks=design.blocks)
     parts = _model(design), _cost(design, layout), _bounds(design)
     return LinearScheme(layout, *parts, design.gamma, design=design)
 

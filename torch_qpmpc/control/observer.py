@@ -1,4 +1,4 @@
-"""Estimates of a plant's state x and disturbance w, side by side as e: by filter or by window."""
+"""Estimates of a plant's state x and disturbance w, side by side as e, by a Kalman filter."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import scipy.linalg
 from scipy.linalg import block_diag
 
 from torch_qpmpc.control.design import Design, largest
-from torch_qpmpc.control.disturbance import RANK, check_observable
+from torch_qpmpc.control.disturbance import check_observable
 from torch_qpmpc.control.scaling import ranges
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
@@ -133,26 +133,3 @@ def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
     with np.errstate(divide="ignore"):
         known = np.where(effects > 0, np.maximum(1.0, moved / effects), np.inf)
     return ABSURD * usual, ABSURD * known
-
-
-def windowed(observer: Observer) -> Observer:
-    """Return the observer whose estimate follows from the last q outputs and inputs alone.
-
-    The outputs of q steps have as many entries as e: q = L + 1 with an identification's L lags and
-    a disturbance for each output. The gain is F^{q-1} O^{-1} [0; ..; I] with O = [H; H F; ..; H
-    F^{q-1}], which makes F - F L H nilpotent.
-
-    Raises:
-        QPError: the outputs of q steps do not determine e.
-    """
-    F, H = observer.F, observer.H
-    n_y, steps = len(H), len(F) // len(H)
-    powers = [np.linalg.matrix_power(F, k) for k in range(max(steps, 1))]
-    O = np.vstack([H @ power for power in powers])  # noqa: E741
-    sizes = np.linalg.svd(O, compute_uv=False)
-    if len(F) % n_y or sizes[-1] <= RANK * sizes[0]:
-        got = f"{len(F)} states and disturbances, which no whole number of {n_y} outputs determines"
-        remedy = "Take a model from qm.identify, or leave window out."
-        raise QPError.expected("window", got, "a model whose outputs do", remedy)
-    last = np.eye(len(F))[:, -n_y:]
-    return observer._replace(L=powers[-1] @ np.linalg.solve(O, last))

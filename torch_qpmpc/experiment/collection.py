@@ -40,7 +40,6 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
         1 if si is None else si.windows,
         seed=cfg.seed,
         active_rows=len(mpc.G),
-        n_x=mpc.n_x,
         preview_key=preview_key(mpc),
     )
 

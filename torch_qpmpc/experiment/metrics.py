@@ -100,8 +100,7 @@ def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[s
     if true_model is None:
         return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
     metrics = structure_metrics(mpc, true_model)
-    sizes = mpc.n_x, mpc.n_u, None, mpc.past, mpc.n_d
-    start = nearest_model(prediction_form(mpc.C_0, *sizes))
+    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, n_d=mpc.n_d))
     A, B, offset, *E = true_model
     return {
         "canonical_distance": metrics["distance_to_mpc"],

@@ -142,8 +142,6 @@ def _harmless(line: str) -> str:
 def _layout(mpc: QPMPC, labels: Labels) -> list[str]:
     """Describe the entries of p and u."""
     blocks = [("d", f"d_{k}", mpc.n_d) for k in range(mpc.horizon + 1) if mpc.n_d]
-    for k in range(1 - mpc.past, 0):
-        blocks += [("x", f"x_{k}", mpc.n_x), ("u", f"u_{k}", mpc.n_u)]
     blocks.append(("x", "x_0", mpc.n_x))
     lines, start = [], 0
     for kind, name, size in blocks:

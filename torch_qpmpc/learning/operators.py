@@ -1,7 +1,7 @@
 """TensorDict modules that make a QPMPC the critic, value or actor of a TorchRL script.
 
 What V fixes, p, is the entry ``observation``; with a ``preview_key``, it is the preview of known
-signals followed by the observation. Without either previews or past outputs it is the state s.
+signals followed by the observation. Without previews it is the state s.
 
 With ``theta_keys``, entries that an upstream module writes, such as `ThetaNetwork`, are residuals
 of theta, and each QP of the batch has its own.

@@ -37,8 +37,8 @@ def system_identification_penalty(C: Tensor, windows: Tensor, b: Tensor | None =
 
     Args:
         C: ``(n_c, n_z)``.
-        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a past or a preview,
-            s_j is p at step j, and the later s are the measured outputs.
+        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a preview, s_j is p at
+            step j.
         b: ``(n_c,)``; None for zero.
 
     Raises:
@@ -61,7 +61,7 @@ class DeviationPenalty(nn.Module):
         C_0: the banded matrix, ``(N n_x, n_z)``.
         n_x: number of states.
         n_u: number of actions.
-        past, n_d: L and the entries of d_k, as in `QPMPC`.
+        n_d: entries of d_k, as in `QPMPC`.
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
@@ -85,7 +85,6 @@ class DeviationPenalty(nn.Module):
         C_0: Tensor,
         n_x: int,
         n_u: int,
-        past: int = 1,
         n_d: int = 0,
         *,
         c_1: float = 1.0,
@@ -97,14 +96,13 @@ class DeviationPenalty(nn.Module):
             check_number(name, weight, _finite, "a finite weight >= 0")
         check_whole("n_x", n_x, 1)
         check_whole("n_u", n_u, 1)
-        check_whole("past", past, 1)
         check_whole("n_d", n_d, 0)
         remedy = "Pass the C_0 of a QPMPC."
         check_tensor("C_0", ungraded("C_0", C_0), "N n_x", "n_z", batched=False, remedy=remedy)
         if not C_0.isfinite().all():
             raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
         horizon = max(C_0.shape[0] // n_x, 1)
-        distance = band_distance(Layout(n_x, n_u, horizon, past, n_d)).to(C_0)
+        distance = band_distance(Layout(n_x, n_u, horizon, n_d)).to(C_0)
         if distance.shape != C_0.shape:
             raise QPError.expected(
                 "C_0",
@@ -123,7 +121,7 @@ class DeviationPenalty(nn.Module):
         Raises:
             QPError: as in `DeviationPenalty`.
         """
-        return cls(mpc.C_0, mpc.n_x, mpc.n_u, mpc.past, mpc.n_d, **weights)
+        return cls(mpc.C_0, mpc.n_x, mpc.n_u, mpc.n_d, **weights)
 
     def forward(self, C: Tensor) -> Tensor:
         """Return the penalty of C ``(N n_x, n_z)``, a scalar."""

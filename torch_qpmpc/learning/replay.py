@@ -31,17 +31,14 @@ ACTIVE_SET = "active_set"
 ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
 
 
-def windows_to_tau(
-    windows: TensorDictBase, n_x: int | None = None, preview_key: NestedKey | None = None
-) -> Tensor:
-    """Return tau = [p_j, a_j, y_{j+1}, a_{j+1}, ..., y_{j+N}] of eq:sdp3, in the order of z.
+def windows_to_tau(windows: TensorDictBase, preview_key: NestedKey | None = None) -> Tensor:
+    """Return tau = [p_j, a_j, s_{j+1}, a_{j+1}, ..., s_{j+N}] of eq:sdp3, in the order of z.
 
     p_j is what V fixes at step j: the state s_j or, in general, the preview and the observation.
 
     Args:
         windows: ``(M, N)`` consecutive transitions along the last dimension, with
             ``observation`` ``(M, N, n)``, ``action`` and ``("next", "observation")``.
-        n_x: the last n_x entries of the observation are the outputs y; by default, all of them.
         preview_key: the key of the preview; None, the default, if p is the observation.
 
     Returns:
@@ -59,8 +56,7 @@ def windows_to_tau(
         want = f"consecutive transitions (M, N) with {names}, action, (next, observation)"
         raise QPError.expected("windows", f"shape {tuple(windows.shape)} with {present}", want)
     p = [windows[key][..., 0, :] for key in known]
-    y = windows["next", "observation"][..., -(n_x or 0) :]
-    pairs = torch.cat([windows["action"], y], dim=-1)
+    pairs = torch.cat([windows["action"], windows["next", "observation"]], dim=-1)
     return torch.cat([*p, pairs.flatten(-2)], dim=-1)
 
 
@@ -77,7 +73,7 @@ class Replay:
         device: device of the stored data and of the generator.
         active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
             bytes each, under `ACTIVE_SETS`; see `remember`.
-        n_x, preview_key: see `windows_to_tau`.
+        preview_key: see `windows_to_tau`.
 
     Attributes:
         transitions: the buffer that `extend` writes; samples single rows uniformly.
@@ -100,7 +96,6 @@ class Replay:
         seed: int = 0,
         device: torch.device | str = "cpu",
         active_rows: int | None = None,
-        n_x: int | None = None,
         preview_key: NestedKey | None = None,
     ) -> None:
         sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
@@ -115,7 +110,7 @@ class Replay:
             remedy = f"The smallest is {window * num_envs}."
             raise QPError.expected("capacity", capacity, expected, remedy)
         self.window, self.num_envs, self.active_rows = window, num_envs, active_rows
-        self.n_x, self.preview_key = n_x, preview_key
+        self.preview_key = preview_key
         self.generator = torch.Generator(device=device).manual_seed(seed)
         storage = LazyTensorStorage(capacity, ndim=2, device=device)
         options: dict[str, Any] = {"storage": storage, "generator": self.generator}
@@ -214,7 +209,7 @@ class Replay:
             remedy = "Collect more, until has_windows() is True."
             expected = f"{self.window} consecutive transitions"
             raise QPError.expected("replay", got, expected, remedy) from error
-        return windows_to_tau(sample.reshape(-1, self.window), self.n_x, self.preview_key)
+        return windows_to_tau(sample.reshape(-1, self.window), self.preview_key)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored data (not copied: save them at once), write position and generator."""

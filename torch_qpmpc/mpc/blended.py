@@ -198,7 +198,7 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
     """Return a copy of ``model``, which may be its arguments, for a `QPMPC` of sizes ``layout``.
 
     Raises:
-        QPError: it is none, it has other sizes, or the QPMPC has a window or a preview.
+        QPError: it is none, it has other sizes, or the QPMPC has a preview.
     """
     if isinstance(model, BlendedModel):
         copy = BlendedModel(**model.arguments)
@@ -209,9 +209,9 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
         got = f"keys {', '.join(map(str, model))}" if isinstance(model, Mapping) else repr(model)
         remedy = "identify_blended returns one."
         raise QPError.expected("schedule", got, "a BlendedModel, or its arguments", remedy)
-    sizes = (layout.n_x, layout.n_u, layout.past, layout.n_d)
-    if sizes != (own := (*copy.B.shape[-2:], 1, 0)):
-        got, expected = (f"n_x, n_u, past, n_d = {x}" for x in (own, sizes))
+    sizes = (layout.n_x, layout.n_u, layout.n_d)
+    if sizes != (own := (*copy.B.shape[-2:], 0)):
+        got, expected = (f"n_x, n_u, n_d = {x}" for x in (own, sizes))
         raise QPError.expected("schedule", got, f"{expected}, as the QPMPC")
     return copy
 

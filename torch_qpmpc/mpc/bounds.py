@@ -17,14 +17,14 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.parametrizations import LinearRows
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
-PAIRS = ("state_bounds", "action_bounds", "rate_bounds")
+PAIRS = ("state_bounds", "action_bounds")
 ROWS = ("constraints", "terminal_constraints")
-SLACKS = ("state_slack", "action_slack", "constraint_slack", "rate_slack")
+SLACKS = ("state_slack", "action_slack", "constraint_slack")
 
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Bounds of states, actions, linear rows and rates, each hard or soft with its price.
+    """Bounds of states, actions and linear rows, each hard or soft with its price.
 
     Args:
         state_bounds, action_bounds: pairs (lower, upper) of ``(n_x,)`` and of ``(n_u,)``; unbounded
@@ -33,11 +33,10 @@ class Bounds:
             as the triple (D, lower, upper) of ``(m, n_x + n_u)`` and ``(m,)`` twice. With a preview
             D multiplies [d_k; x_k; u_k]: bounds that change with time are entries of d_k.
         terminal_constraints: the same for x_N, with D^f ``(m_f, n_x)``, or for [d_N; x_N].
-        rate_bounds: a pair (lower, upper) of ``(n_u,)`` for u_k - u_{k-1}; needs past >= 2.
-        state_slack, action_slack, constraint_slack, rate_slack: the slack weights w of the rows of
-            states, of actions, of mixed and terminal constraints, and of rates; ``inf`` makes them
-            hard. By default, actions and rates are hard and the others soft. Pass one weight or one
-            per entry, for ``constraint_slack`` of the rows of D and then of D^f.
+        state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
+            actions, and of mixed and terminal constraints; ``inf`` makes them hard. By default,
+            actions are hard and the others soft. Pass one weight or one per entry, for
+            ``constraint_slack`` of the rows of D and then of D^f.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
 
     Raises:
@@ -56,19 +55,13 @@ class Bounds:
     action_bounds: Any = None
     constraints: Any = None
     terminal_constraints: Any = None
-    rate_bounds: Any = None
     state_slack: Any = 100.0
     action_slack: Any = torch.inf
     constraint_slack: Any = 100.0
-    rate_slack: Any = torch.inf
     discount_slack: bool = False
 
     def __post_init__(self) -> None:
         check_flag("discount_slack", self.discount_slack)
-        price = self.rate_slack
-        if self.rate_bounds is None and not (isinstance(price, Real) and price == torch.inf):
-            remedy = "It is the price of violating them: pass rate_bounds, too."
-            raise QPError.expected("rate_slack", repr(price), "inf without rate_bounds", remedy)
         readers = dict.fromkeys(PAIRS, _pair) | dict.fromkeys(ROWS, _linear_rows)
         for name, read in (readers | dict.fromkeys(SLACKS, _slack)).items():
             value = getattr(self, name)
@@ -79,29 +72,20 @@ class Bounds:
         """Return ``layout`` with the numbers of these rows."""
         linear = (self.constraints, self.terminal_constraints)
         n_mixed, n_terminal = (0 if rows is None else len(rows[0]) for rows in linear)
-        n_rates = 0 if self.rate_bounds is None else layout.n_u
-        return replace(layout, n_mixed=n_mixed, n_terminal=n_terminal, n_rates=n_rates)
+        return replace(layout, n_mixed=n_mixed, n_terminal=n_terminal)
 
     def rows(self, layout: Layout) -> dict[str, Tensor]:
         """Return G, lb, ub and w, inf on hard rows, of the sizes ``layout``, as `counted`.
 
         Raises:
-            QPError: a shape does not match the sizes, or rates are bounded with past=1.
+            QPError: a shape does not match the sizes.
         """
         n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
-        if self.rate_bounds is not None and layout.past == 1:
-            remedy = "The window then holds u_{-1}."
-            raise QPError.expected("rate_bounds", "bounds with past=1", "past >= 2", remedy)
         D = _matching_rows("constraints", self.constraints, n_d + layout.n)
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
-        sizes = (n_x, n_u, layout.n_rates)
-        x, u, rates = (
-            _matching_pair(name, getattr(self, name), size)
-            for name, size in zip(PAIRS, sizes, strict=True)
-        )
-        lower, upper = (
-            layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], rates, strict=True)
-        )
+        x = _matching_pair("state_bounds", self.state_bounds, n_x)
+        u = _matching_pair("action_bounds", self.action_bounds, n_u)
+        lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
         n_linear = layout.n_mixed + layout.n_terminal
         price = _matching_slack("constraint_slack", self.constraint_slack, n_linear)
         w = layout.rows(
@@ -109,7 +93,6 @@ class Bounds:
             _matching_slack("action_slack", self.action_slack, n_u),
             price[: layout.n_mixed],
             price[layout.n_mixed :],
-            _matching_slack("rate_slack", self.rate_slack, n_u)[: layout.n_rates],
         )
         G = LinearRows(layout, tied=True)(D[0], D_f[0])
         return {"G": G, "lb": lower, "ub": upper, "w": w}

@@ -2,12 +2,11 @@
 
 Known entries come first in z, then the plan:
 
-    z = [d_0, .., d_N,  y_{1-L}, u_{1-L}, .., y_{-1}, u_{-1}, y_0,  u_0, y_1, u_1, .., y_N]
-         preview        past window, up to the current output       plan
+    z = [d_0, .., d_N, x_0,  u_0, x_1, u_1, .., x_N]
+         preview and state   plan
 
-With L = 1 and no preview it is the paper's z, whose states y_k are x_k. G has one row for
-each entry of [x_0, u_0, .., x_N], then D on (d_k, x_k, u_k) for each stage, then D^f on (d_N, x_N)
-(eq:v1c4), then one row for each entry of the changes u_k - u_{k-1}.
+Without a preview it is the paper's z. G has one row for each entry of [x_0, u_0, .., x_N], then D
+on (d_k, x_k, u_k) for each stage, then D^f on (d_N, x_N) (eq:v1c4).
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from torch import Tensor
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 
-SIZES = ("n_x", "n_u", "horizon", "past", "n_d")
-COUNTS = ("n_mixed", "n_terminal", "n_rates")
+SIZES = ("n_x", "n_u", "horizon", "n_d")
+COUNTS = ("n_mixed", "n_terminal")
 
 
 @dataclass(frozen=True)
@@ -31,13 +30,11 @@ class Layout:
     """The sizes of z and of G.
 
     Attributes:
-        n_x: number of states, or of measured outputs.
+        n_x: number of states.
         n_u: number of actions.
         horizon: N, at least 1.
-        past: L, the number of outputs in the window of the past, at least 1.
         n_d: entries of a stage's preview d_k.
         n_mixed, n_terminal: rows of D and of D^f, which a `Scheme` counts.
-        n_rates: entries of u_k - u_{k-1} that have bounds, n_u or 0; likewise.
         blocks: numbers of stages that share one action, with the sum N; none if each has its own.
 
     Raises:
@@ -45,7 +42,7 @@ class Layout:
 
     Example:
         >>> import torch_qpmpc as qm
-        >>> layout = qm.Layout(n_x=2, n_u=1, horizon=5, past=3)
+        >>> layout = qm.Layout(n_x=2, n_u=1, horizon=5, n_d=1)
         >>> layout.n_p, layout.n_z
         (8, 23)
     """
@@ -53,11 +50,9 @@ class Layout:
     n_x: int
     n_u: int
     horizon: int
-    past: int = 1
     n_d: int = 0
     n_mixed: int = 0
     n_terminal: int = 0
-    n_rates: int = 0
     blocks: Sequence[int] = ()
 
     def __post_init__(self) -> None:
@@ -77,57 +72,42 @@ class Layout:
         return (self.horizon + 1) * self.n_d
 
     @property
-    def n_before(self) -> int:
-        """Entries of z before x_0."""
-        return self.n_preview + (self.past - 1) * self.n
-
-    @property
     def n_p(self) -> int:
         """Entries of z that V fixes: all up to x_0."""
-        return self.n_before + self.n_x
+        return self.n_preview + self.n_x
 
     @property
     def n_z(self) -> int:
         """Entries of z, known and planned."""
-        return self.n_before + self.horizon * self.n + self.n_x
+        return self.n_p + self.horizon * self.n
 
     @property
     def n_linear(self) -> int:
         """Rows of D and D^f in G."""
         return self.horizon * self.n_mixed + self.n_terminal
 
-    @property
-    def reach(self) -> int:
-        """Entries of the window (y_{k+1-L}, u_{k+1-L}, .., y_k, u_k) that y_{k+1} depends on."""
-        return self.past * self.n
-
     def stages(self, x: Tensor, u: Tensor) -> Tensor:
         """Arrange x ``(N + 1, n_x)`` and u ``(N + 1, n_u)`` as [x_0, u_0, .., x_N], without u_N."""
         x, u = (part.expand(self.horizon + 1, -1) for part in (x, u))
-        return torch.cat((x, u), dim=-1).flatten()[: self.n_z - self.n_before]
+        return torch.cat((x, u), dim=-1).flatten()[: self.n_z - self.n_preview]
 
-    def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor, rates: Tensor) -> Tensor:
+    def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor) -> Tensor:
         """Arrange values of the rows of G ``(n_g,)``.
 
-        The values belong to x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)``, D^f as
-        ``D_f`` ``(n_terminal,)`` and u_k - u_{k-1} as ``rates`` ``(N, n_rates)``; a leading N + 1
-        or N may be 1, for the same values in all stages.
+        The values belong to x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)`` and D^f as
+        ``D_f`` ``(n_terminal,)``; a leading N + 1 or N may be 1, for the same values in all stages.
         """
-        D, rates = (part.expand(self.horizon, -1).flatten() for part in (D, rates))
-        return torch.cat((self.stages(x, u), D, D_f, rates))
+        return torch.cat((self.stages(x, u), D.expand(self.horizon, -1).flatten(), D_f))
 
     def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
         """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``.
 
-        It is one for the past. ``gamma`` is the discount.
+        ``gamma`` is the discount.
         """
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
         d, x, u = (powers.expand(-1, size) for size in (self.n_d, self.n_x, self.n_u))
-        past = powers.new_ones(self.n_before - self.n_preview)
-        z = torch.cat((d.flatten(), past, self.stages(x, u)))
-        sizes = (self.n_mixed, self.n_terminal, self.n_rates)
-        D, D_f, rates = (powers.expand(-1, size) for size in sizes)
-        return z, self.rows(x, u, D[:-1], D_f[-1], rates[:-1])
+        D, D_f = (powers.expand(-1, size) for size in (self.n_mixed, self.n_terminal))
+        return torch.cat((d.flatten(), self.stages(x, u))), self.rows(x, u, D[:-1], D_f[-1])
 
     def ties(self, part: str) -> Tensor:
         """Return the index of the value of each entry of a tied ``part``, q, b, lb, ub or w.
@@ -142,31 +122,29 @@ class Layout:
             return x.repeat(self.horizon)
         if part == "q":
             d, first = torch.arange(self.n_d), n + n_x
-            past = torch.arange(self.n_before - self.n_preview) + first + 2 * self.n_d
             d = torch.cat(((first + d).repeat(self.horizon), first + self.n_d + d))
-            return torch.cat((d, past, self.stages(own, u)))
+            return torch.cat((d, self.stages(own, u)))
         if part == "w":
             x, n = own, n + n_x
-        D, D_f, rates = (torch.arange(i) for i in (self.n_mixed, self.n_terminal, self.n_rates))
-        D_f, rates = self.n_mixed + D_f, self.n_mixed + self.n_terminal + rates
-        return self.rows(x, u, n + D, n + D_f, n + rates)
+        D, D_f = (torch.arange(i) for i in (self.n_mixed, self.n_terminal))
+        return self.rows(x, u, n + D, n + self.n_mixed + D_f)
 
     def signals(self) -> Tensor:
         """Return the index in [x; u; d] of the signal in each entry of z, ``(n_z,)``."""
-        stages = torch.arange(self.n).repeat(self.past + self.horizon)
+        stages = torch.arange(self.n).repeat(self.horizon + 1)
         d = torch.arange(self.n, self.n + self.n_d).repeat(self.horizon + 1)
         return torch.cat((d, stages[: self.n_z - self.n_preview]))
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of ``z``."""
-        plan, terminal = z[..., self.n_before : -self.n_x], z[..., None, -self.n_x :]
+        plan, terminal = z[..., self.n_preview : -self.n_x], z[..., None, -self.n_x :]
         stages = plan.unflatten(-1, (self.horizon, self.n))
         return torch.cat((stages[..., : self.n_x], terminal), -2), stages[..., self.n_x :]
 
     def from_stage(self, blocks: Tensor) -> Tensor:
         """Return rows ``(N i, n_z)`` with ``blocks`` ``(N, i, n_d + n)`` at d_k, x_k and u_k."""
         d, plan = (torch.block_diag(*x) for x in blocks.split((self.n_d, self.n), dim=-1))
-        d = F.pad(d, (0, self.n_before - d.shape[-1]))
+        d = F.pad(d, (0, self.n_preview - d.shape[-1]))
         return torch.cat((d, F.pad(plan, (0, self.n_x))), dim=-1)
 
     def from_terminal(self, block: Tensor) -> Tensor:
@@ -178,22 +156,13 @@ class Layout:
     def stage_blocks(self, rows: Tensor) -> Tensor:
         """Return the entries of rows ``(N i, n_z)`` at d_k, x_k, u_k, ``(N, i, n_d + n)``."""
         d = _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
-        plan = _diagonal_blocks(rows, self.horizon, self.n_before, self.n, self.n)
+        plan = _diagonal_blocks(rows, self.horizon, self.n_preview, self.n, self.n)
         return torch.cat((d, plan), dim=-1)
 
     def terminal_block(self, rows: Tensor) -> Tensor:
         """Return the entries of rows ``(i, n_z)`` at d_N and x_N, ``(i, n_d + n_x)``."""
         d = rows[:, self.n_preview - self.n_d : self.n_preview]
         return torch.cat((d, rows[:, self.n_z - self.n_x :]), dim=-1)
-
-    def model_blocks(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what row block k of ``rows``, as of C, has at its window and at d_k, with an N."""
-        window = _diagonal_blocks(rows, self.horizon, self.n_preview, self.reach, self.n)
-        return window, _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
-
-    def rate_rows(self) -> Tensor:
-        """Return the rows of G for u_k - u_{k-1}, ``(N n_rates, n_z)``."""
-        return self._changes(self.n_before - self.n).flatten(0, 1)
 
     @property
     def held_stages(self) -> Tensor:
@@ -204,7 +173,9 @@ class Layout:
 
     def hold_rows(self) -> Tensor:
         """Return the rows of u_k - u_{k-1} for the held stages, ``(h n_u, n_z)``."""
-        return self._changes(self.n_before)[self.held_stages[1:]].flatten(0, 1)
+        unit = torch.eye(self.n_z, dtype=torch.float64)
+        actions = unit[self.n_preview : -self.n_x].unflatten(0, (-1, self.n))[:, self.n_x :]
+        return (actions[1:] - actions[:-1])[self.held_stages[1:]].flatten(0, 1)
 
     def repeated(self, of_actions: Tensor) -> Tensor:
         """Return True at the rows of G that bound the actions of held stages, ``(n_g,)``.
@@ -214,13 +185,7 @@ class Layout:
         held, none = self.held_stages.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
         u = F.pad(held, (0, 0, 0, 1)).expand(-1, self.n_u)
         D_f = none.new_zeros(self.n_terminal)
-        return self.rows(none, u, held & of_actions, D_f, held.expand(-1, self.n_rates))
-
-    def _changes(self, first: int) -> Tensor:
-        """Return the rows of u_k - u_{k-1}, ``(i, n_u, n_z)``, after the stage at ``first``."""
-        unit = torch.eye(self.n_z, dtype=torch.float64)
-        actions = unit[first : self.n_z - self.n_x].unflatten(0, (-1, self.n))[:, self.n_x :]
-        return actions[1:] - actions[:-1]
+        return self.rows(none, u, held & of_actions, D_f)
 
     def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from blocks of the stages and of x_N, or from a full H.
@@ -231,7 +196,7 @@ class Layout:
         H = blocks[0]
         if kind == "diagonal":
             # Operations whose batched gradients (`GaussNewton`) are not a loop over the batch.
-            before, stages = H.new_zeros(self.n_before), H.expand(self.horizon, self.n)
+            before, stages = H.new_zeros(self.n_preview), H.expand(self.horizon, self.n)
             entries = torch.cat((before, stages.flatten(), blocks[1]))
             return torch.diag_embed(discount * entries)
         if kind == "block":
@@ -247,15 +212,11 @@ class Layout:
         n_d, size = self.n_d, self.n_d + self.n
         blocks = (*stage.expand(self.horizon, size, size), terminal)
         plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
-        if not self.n_before:
-            return plan
         if not n_d:
-            return F.pad(plan, (self.n_before, 0, self.n_before, 0))
+            return plan
         preview = torch.block_diag(*(block[:n_d, :n_d] for block in blocks))
         cross = torch.block_diag(*(block[:n_d, n_d:] for block in blocks))
-        past = self.n_before - self.n_preview
-        upper = torch.cat((F.pad(preview, (0, past)), cross), dim=-1)
-        lower = F.pad(torch.cat((cross.mT, F.pad(plan, (past, 0))), dim=-1), (0, 0, past, 0))
+        upper, lower = torch.cat((preview, cross), dim=-1), torch.cat((cross.mT, plan), dim=-1)
         return torch.cat((upper, lower))
 
 

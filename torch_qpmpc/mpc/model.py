@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
@@ -23,9 +22,8 @@ class Model:
     has such matrices: ``Model(system.A, system.B)``.
 
     Args:
-        A: ``(n_x, n_x)``, or one per stage, ``(N, n_x, n_x)``. With a window of L outputs it is
-            [A_1, .., A_L], side by side, the newest first.
-        B: ``(n_x, n_u)``, or one per stage; with a window [B_1, .., B_L].
+        A: ``(n_x, n_x)``, or one per stage, ``(N, n_x, n_x)``.
+        B: ``(n_x, n_u)``, or one per stage.
         E: the factor of the preview d_k, ``(n_x, n_d)``, or one per stage; zero by default.
         offset: ``(n_x,)``; zero by default.
         C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, as of a multi-step predictor, in place of the
@@ -57,10 +55,8 @@ class Model:
         got = f"shapes {A} and {B}"
         if len(A) < 2 or len(B) < 2:
             raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
-        n_x, n_lagged = A[-2:]
-        if B[-2] != n_x or n_lagged % max(n_x, 1) or B[-1] % max(n_lagged // max(n_x, 1), 1):
-            remedy = "L is 1 without a window of the past."
-            raise QPError.expected("A, B", got, "(n_x, L n_x) and (n_x, L n_u)", remedy)
+        if not A[-2] == A[-1] == B[-2]:
+            raise QPError.expected("A, B", got, "(n_x, n_x) and (n_x, n_u)")
 
     def layout(self, horizon: int) -> Layout:
         """Return the sizes that A, B and E have with ``horizon`` stages.
@@ -71,10 +67,8 @@ class Model:
         if self.A is None or self.B is None:
             name = "A" if self.A is None else "B"
             raise QPError.expected(name, "None", "a matrix", "Or pass a Layout.")
-        n_x, n_lagged = self.A.shape[-2:]
-        past = max(n_lagged // max(n_x, 1), 1)
         n_d = 0 if self.E is None else self.E.shape[-1]
-        return Layout(n_x, self.B.shape[-1] // past, horizon, past, n_d)
+        return Layout(self.B.shape[-2], self.B.shape[-1], horizon, n_d)
 
     def matrices(self, layout: Layout, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return A, B and E of the sizes ``layout``.
@@ -84,21 +78,17 @@ class Model:
         Raises:
             QPError: a shape does not match the sizes.
         """
-        n_x, n_u, past, n_d = layout.n_x, layout.n_u, layout.past, layout.n_d
+        n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
         A, B, E = self.A, self.B, self.E
         if A is None:
             noise = torch.randn(n_x, n_x, generator=random, dtype=torch.float32)
-            A = torch.eye(n_x, dtype=torch.float32) + 0.1 * noise
-            A = F.pad(A, (0, (past - 1) * n_x)).double()
+            A = (torch.eye(n_x, dtype=torch.float32) + 0.1 * noise).double()
         if B is None:
-            B = 0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)
-            B = F.pad(B, (0, (past - 1) * n_u)).double()
+            B = (0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)).double()
         E = A.new_zeros(n_x, n_d) if E is None else E
-        if A.shape[-1:] != (past * n_x,) or B.shape[-1:] != (past * n_u,):
+        if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
             got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"
-            want = f"({n_x}, {past * n_x}) and ({n_x}, {past * n_u})"
-            remedy = "" if past == 1 else f"[A_1, .., A_L] and [B_1, .., B_L] for past={past}."
-            raise QPError.expected("A, B", got, want, remedy)
+            raise QPError.expected("A, B", got, f"({n_x}, {n_x}) and ({n_x}, {n_u})")
         if E.shape[-2:] != (n_x, n_d):
             remedy = "It multiplies the preview d_k, of n_d entries."
             raise QPError.expected("E", f"shape {tuple(E.shape)}", f"({n_x}, {n_d})", remedy)

@@ -71,14 +71,12 @@ class QPMPC(nn.Module):
     x_N, discounted by gamma^N. Parameters and buffers are float64, inputs of any float dtype;
     outputs have the dtype of the input.
 
-    More than x_0 may be known: the past and, ahead of time, signals such as prices, forecasts and
-    references. With the *window* of the last L outputs and L - 1 actions between them (``past=L``)
-    and the *preview* d_0, .., d_N (``n_d`` entries each), z has two more parts,
+    More than x_0 may be known ahead of time: signals such as prices, forecasts and references, the
+    *preview* d_0, .., d_N (``n_d`` entries each). They come first in z,
 
-        z = [d_0, .., d_N,  x_{1-L}, u_{1-L}, .., x_{-1}, u_{-1}, x_0,  u_0, x_1, .., x_N],
+        z = [d_0, .., d_N, x_0,  u_0, x_1, .., x_N],
 
-    V fixes its first n_p entries p, up to x_0, and Q fixes p and u_0. All s below are p; the x_k
-    are the measured outputs, which need not be a state.
+    V fixes its first n_p entries p, up to x_0, and Q fixes p and u_0. All s below are p.
 
     Args:
         scheme: the sizes, the model, the cost, the bounds and the discount.
@@ -104,7 +102,7 @@ class QPMPC(nn.Module):
         layout: its `Layout`.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
         schedule: the `BlendedModel`, a copy of the one passed; None without one.
-        n_p: the number of entries of p, (N + 1) n_d + (L - 1) (n_x + n_u) + n_x.
+        n_p: the number of entries of p, (N + 1) n_d + n_x.
 
     Raises:
         QPError: an argument is invalid.
@@ -164,7 +162,7 @@ class QPMPC(nn.Module):
         backend(solver)
         self.scheme, self.layout, self._random = scheme, scheme.layout, scheme.is_random
         self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
-        self.past, self.n_d, self.gamma = self.layout.past, self.layout.n_d, scheme.gamma
+        self.n_d, self.gamma = self.layout.n_d, scheme.gamma
         self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
@@ -195,30 +193,28 @@ class QPMPC(nn.Module):
                 parameters.attach(self, name, self._parametrizations_for(name))
 
     @classmethod
-    def of(
-        cls, n_x: int, n_u: int, horizon: int, past: int = 1, n_d: int = 0, **options: Any
-    ) -> Self:
+    def of(cls, n_x: int, n_u: int, horizon: int, n_d: int = 0, **options: Any) -> Self:
         """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
 
         A random start is one to learn from: a `UserWarning` says so when the policy first acts
         before a state_dict is loaded.
 
         Args:
-            n_x, n_u, horizon, past, n_d: see `Layout`.
+            n_x, n_u, horizon, n_d: see `Layout`.
             options: the keyword arguments of `QPMPC` and of `Scheme.of`.
 
         Raises:
             QPError: an argument is invalid.
         """
         own = {x: options.pop(x) for x in (*KEYWORDS, "schedule") if x in options}
-        return cls(Scheme.of(n_x, n_u, horizon, past, n_d, **options), **own)
+        return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
 
     @classmethod
     def from_model(cls, A: Any, B: Any, horizon: int, **options: Any) -> Self:
         """Return a QPMPC whose C starts as the banded C_0 of the model x+ = A x + B u (eq:cband).
 
         Args:
-            A, B: see `Model`; their shapes give n_x, n_u and past.
+            A, B: see `Model`; their shapes give n_x and n_u.
             horizon: N.
             options: as in `of`; ``stage_weight`` is required, and the shape of E gives n_d.
 
@@ -230,7 +226,7 @@ class QPMPC(nn.Module):
         layout = Model(A, B, options.get("E")).layout(horizon)
         check_names(options)
         check_chosen(options.get("stage_weight"), layout)
-        arguments = {"past": layout.past, "n_d": layout.n_d, "A": A, "B": B} | options
+        arguments = {"n_d": layout.n_d, "A": A, "B": B} | options
         return cls.of(layout.n_x, layout.n_u, layout.horizon, **arguments)
 
     @classmethod
@@ -480,7 +476,7 @@ class QPMPC(nn.Module):
         """
         for name, leaf in self._projected().items():
             dense = self.hessian != "diagonal" and name != "w"
-            n_free = self.layout.n_before if self.hessian == "full" else self.n_d
+            n_free = self.layout.n_preview if self.hessian == "full" else self.n_d
             of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
@@ -604,7 +600,7 @@ class QPMPC(nn.Module):
             getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
 
     def extra_repr(self) -> str:
-        prefix = f"past={self.past}, n_d={self.n_d}, " if self.n_p > self.n_x else ""
+        prefix = f"n_d={self.n_d}, " if self.n_d else ""
         return (
             f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, "
             f"{prefix}hessian={self.hessian!r}, structure={self.structure!r}, "

@@ -39,7 +39,7 @@ def parametrizations_for(
     if tied and name in ("q", "b", "lb", "ub", "w"):
         chain.append(Tied(name, layout.ties(name)))
     dense = hessian != "diagonal" and name != "w"
-    n_free = layout.n_before if hessian == "full" else layout.n_d
+    n_free = layout.n_preview if hessian == "full" else layout.n_d
     if name in SIGNED and step == CHOLESKY:
         chain.append(Cholesky(n_free) if dense else SquareRoot())
     elif name in ("H", "H_f"):
@@ -222,7 +222,7 @@ class Tied(nn.Module):
 
 
 class LinearRows(nn.Module):
-    """G of mixed constraints (eq:v1c4): the plan, D for each stage, D^f for x_N, and rates.
+    """G of mixed constraints (eq:v1c4): the plan, D for each stage and D^f for x_N.
 
     D is ``(n_mixed, n_d + n_x + n_u)``, with a leading N if it varies by stage, and D^f
     ``(n_terminal, n_d + n_x)``.
@@ -235,11 +235,8 @@ class LinearRows(nn.Module):
     def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
         layout = self.layout
         stages = layout.from_stage(D.expand(layout.horizon, *D.shape[-2:]))
-        plan = torch.eye(layout.n_z)[layout.n_before :].to(D)
-        parts = [plan, stages, layout.from_terminal(D_f)]
-        if layout.n_rates:
-            parts.append(layout.rate_rows().to(D))
-        return torch.cat(parts)
+        plan = torch.eye(layout.n_z)[layout.n_preview :].to(D)
+        return torch.cat((plan, stages, layout.from_terminal(D_f)))
 
     def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
         """Return D and D^f; raise `QPError` if G has other entries."""
@@ -261,10 +258,9 @@ def _check_mask(name: str, mask: Tensor, layout: Layout, chain: list[nn.Module])
         if isinstance(part, Tied):
             tied = torch.equal(mask, mask[part.first][part.index])
         elif isinstance(part, Banded | LinearRows) and part.tied:
-            kinds = layout.model_blocks(mask)
-            if name == "G":
-                kinds = (layout.stage_blocks(_linear_rows(mask, layout)[0]),)
-            tied = all(bool((blocks == blocks[:1]).all()) for blocks in kinds)
+            rows = _linear_rows(mask, layout)[0] if name == "G" else mask
+            blocks = layout.stage_blocks(rows)
+            tied = bool((blocks == blocks[:1]).all())
     if not tied:
         want = "one that is the same for all stages, which structure='tied' ties"
         raise QPError.expected(what, "a mask that differs between stages", want)
@@ -273,8 +269,7 @@ def _check_mask(name: str, mask: Tensor, layout: Layout, chain: list[nn.Module])
 def _linear_rows(G: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
     """Return the rows of G that belong to D and to D^f."""
     mixed = layout.horizon * layout.n_mixed
-    sizes = (layout.n_z - layout.n_before, mixed, layout.n_terminal)
-    _, D, D_f, _ = G.split((*sizes, len(G) - sum(sizes)))
+    _, D, D_f = G.split((layout.n_z - layout.n_preview, mixed, layout.n_terminal))
     return D, D_f
 
 

@@ -74,8 +74,7 @@ def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -
     W = fitted.W[n_d:, n_d:].diagonal() if diagonal else fitted.W
     terminal = W[:n_x] if diagonal else W[: n_d + n_x, : n_d + n_x]
     d, x, u = fitted.q.split((n_d, n_x, n_u))
-    past = fitted.q.new_zeros(layout.n_before - layout.n_preview)
-    q = torch.cat((d.repeat(N + 1), past, layout.stages(x.expand(N + 1, -1), u)))
+    q = torch.cat((d.repeat(N + 1), layout.stages(x.expand(N + 1, -1), u)))
     ahead = gamma ** torch.arange(N + 1, dtype=torch.float64)
     return Cost(W, terminal, hessian, q=q, c=fitted.c * ahead.sum())
 

@@ -119,11 +119,8 @@ def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layo
         layout: the sizes.
 
     Raises:
-        QPError: the scheme has a window or several stages, or there is no solution.
+        QPError: the scheme has several stages, or there is no solution.
     """
-    if layout.past > 1:
-        remedy = "Pass a matrix: its cost to go is one of the whole window."
-        raise QPError.expected("terminal_weight", f"{RICCATI!r} with past > 1", "past=1", remedy)
     W, n_d = torch.diag(W) if W.shape == (layout.n,) else W, layout.n_d
     cross = W.new_zeros(layout.n_x, 0)
     if W.shape == (n_d + layout.n,) * 2:

@@ -81,7 +81,6 @@ class Scheme:
         n_x: int,
         n_u: int,
         horizon: int,
-        past: int = 1,
         n_d: int = 0,
         *,
         blocks: Sequence[int] = (),
@@ -93,7 +92,7 @@ class Scheme:
         """Return the scheme of sizes and of the arguments of its parts by name.
 
         Args:
-            n_x, n_u, horizon, past, n_d, blocks: see `Layout`.
+            n_x, n_u, horizon, n_d, blocks: see `Layout`.
             gamma, seed: see `Scheme`.
             start: initial values of some of q, c, C and b by name, in place of those that follow
                 from the other arguments.
@@ -102,7 +101,7 @@ class Scheme:
         Raises:
             QPError: an argument is invalid.
         """
-        layout = Layout(n_x, n_u, horizon, past, n_d, blocks=blocks)
+        layout = Layout(n_x, n_u, horizon, n_d, blocks=blocks)
         arguments = {**options, **_started(start)}
         model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
         if arguments:

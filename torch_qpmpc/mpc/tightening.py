@@ -112,12 +112,12 @@ def back_off(mpc: QPMPC, W: Tensor, probability: float = 0.95) -> None:
     Riccati equation has no solution, nothing does.
 
     Args:
-        mpc: the QPMPC with its nominal bounds, a tied C and no window.
+        mpc: the QPMPC with its nominal bounds and a tied C.
         W: ``(n_x, n_x)``.
         probability: as in `tighten`.
 
     Raises:
-        QPError: as in `tighten`, or the QPMPC has a free C or a window of more than one step.
+        QPError: as in `tighten`, or the QPMPC has a free C.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -130,9 +130,6 @@ def back_off(mpc: QPMPC, W: Tensor, probability: float = 0.95) -> None:
         array([5.   , 4.178, 4.12 ])
     """
     check_kind("mpc", mpc, QPMPC)
-    if mpc.past > 1:
-        remedy = "A window has no regulator: call tighten with your own covariances."
-        raise QPError.expected("mpc", f"past={mpc.past}", "past=1", remedy)
     check_tensor("W", W, mpc.n_x, mpc.n_x, batched=False)
     A, B, *_ = (x.to(W) for x in mpc.model())
     try:

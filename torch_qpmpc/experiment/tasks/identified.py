@@ -205,7 +205,7 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     size = (log["action"][valid].double() - held).abs().amax(0)
     R = (costs.abs().mean() if costs.any() else 1.0) / size.square()
     gamma, N, zero = scheme.gamma, layout.horizon, R.new_zeros(layout.n_x)
-    q = torch.cat((R.new_zeros(layout.n_before), layout.stages(zero, -R * held)))
+    q = torch.cat((R.new_zeros(layout.n_preview), layout.stages(zero, -R * held)))
     ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()
     c = costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
     c += ahead * (R * held.square()).sum() / 2

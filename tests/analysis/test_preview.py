@@ -1,4 +1,4 @@
-"""A model with lags and previews is read as it is, from the QP and in any gauge."""
+"""A model with previews is read as it is, from the QP and in any gauge."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch_qpmpc.analysis.plots import (
     canonical_figure,
     policy_figure,
 )
-from torch_qpmpc.analysis.policy import local_gain, policy_map, window_model
+from torch_qpmpc.analysis.policy import local_gain, policy_map
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (
     PredictionForm,
@@ -38,10 +38,10 @@ from torch_qpmpc.mpc.riccati import stage_weight
 
 pytestmark = pytest.mark.layout
 
-N_X, N_U, N_D, L, N = 2, 1, 2, 3, 5
-LAYOUT = Layout(N_X, N_U, N, L, N_D)
-A = 0.2 * normal(N_X, L * N_X, seed=1) + 0.4 * torch.eye(N_X, L * N_X)
-B, E, OFFSET = normal(N_X, L * N_U, seed=2), normal(N_X, N_D, seed=3), normal(N_X, seed=4)
+N_X, N_U, N_D, N = 2, 1, 2, 5
+LAYOUT = Layout(N_X, N_U, N, N_D)
+A = 0.2 * normal(N_X, N_X, seed=1) + 0.4 * torch.eye(N_X)
+B, E, OFFSET = normal(N_X, N_U, seed=2), normal(N_X, N_D, seed=3), normal(N_X, seed=4)
 
 
 def scheme(**options: Any) -> QPMPC:
@@ -53,13 +53,9 @@ def scheme(**options: Any) -> QPMPC:
 def step(p: Tensor, U: Tensor, A: Tensor = A, B: Tensor = B, E: Tensor = E) -> Tensor:
     """Step the model over the horizon, ``(N, N_X)``; A, B and E may have a leading N."""
     A, B, E = (x.expand(N, *x.shape[-2:]) for x in (A, B, E))
-    d, window = p[: LAYOUT.n_preview].view(N + 1, N_D), p[LAYOUT.n_preview :]
-    pairs = window[: (L - 1) * (N_X + N_U)].view(L - 1, N_X + N_U)
-    x, u = [*pairs[:, :N_X], window[-N_X:]], [*pairs[:, N_X:]]
+    d, x = p[:-N_X].view(N + 1, N_D), [p[-N_X:]]
     for k in range(N):
-        u.append(U[k])
-        lags = (torch.cat(part[: -L - 1 : -1]) for part in (x, u))
-        x.append(A[k] @ next(lags) + B[k] @ next(lags) + E[k] @ d[k] + OFFSET)
+        x.append(A[k] @ x[-1] + B[k] @ U[k] + E[k] @ d[k] + OFFSET)
     return torch.stack(x[-N:])
 
 
@@ -70,7 +66,7 @@ def model() -> PredictionForm:
 def free_form(seed: int = 0) -> PredictionForm:
     C = banded_matrix(A, B, N, E)
     C = C + 0.1 * normal(*C.shape, seed=seed)
-    return prediction_form(C, N_X, N_U, -OFFSET.repeat(N), L, N_D)
+    return prediction_form(C, N_X, N_U, -OFFSET.repeat(N), N_D)
 
 
 # The prediction form
@@ -96,7 +92,7 @@ def test_solutions_of_the_qp_are_predicted():
 
 def test_a_scheme_in_any_gauge_is_a_scheme():
     C_0, T = banded_matrix(A, B, N, E), normal(N * N_X, N * N_X, seed=6)
-    form = prediction_form(T @ C_0, N_X, N_U, -T @ OFFSET.repeat(N), L, N_D)
+    form = prediction_form(T @ C_0, N_X, N_U, -T @ OFFSET.repeat(N), N_D)
     for part in ("Phi", "Gamma", "phi"):
         assert_close(getattr(form, part), getattr(model(), part), rtol=0, atol=1e-10)
     found, stages = nearest_model(form), stage_models(form)
@@ -120,7 +116,7 @@ def test_errors_of_the_model():
     differences = [(x - y).flatten() for x, y in zip(wrong, (A, B, E), strict=True)]
     expected = torch.cat(differences).norm()
     assert_close(one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
-    s, a, d = normal(50, L * N_X), normal(50, L * N_U, seed=1), normal(50, N_D, seed=2)
+    s, a, d = normal(50, N_X), normal(50, N_U, seed=1), normal(50, N_D, seed=2)
     error = s @ (wrong[0] - A).mT + a @ (wrong[1] - B).mT + d @ (wrong[2] - E).mT
     moment = second_moment(s, a, d)
     expected = error.square().sum(-1).mean().sqrt()
@@ -138,20 +134,7 @@ def test_the_gain_is_the_slope_of_the_policy_in_all_that_is_known():
     assert (K != 0).any(-1).any()
 
 
-def test_the_next_window_is_that_of_the_model():
-    F, G = window_model(A, B)
-    p, U = normal(LAYOUT.n_p), normal(N, N_U, seed=1)
-    p[: LAYOUT.n_preview] = 0
-    w = p[LAYOUT.n_preview :]
-    x_1 = step(p, U)[0] - OFFSET
-    assert_close(F @ w + G @ U[0], torch.cat((w[N_X + N_U :], U[0], x_1)))
-    for one, own in zip(
-        (A[:, :N_X], B[:, :N_U]), window_model(A[:, :N_X], B[:, :N_U]), strict=True
-    ):
-        assert torch.equal(one, own)
-
-
-def test_the_report_of_a_scheme_with_lags_compares_it_with_the_regulator_of_the_window():
+def test_the_report_of_a_scheme_compares_it_with_the_regulator():
     mpc = QPMPC.from_model(
         A, B, 16, E=E, gamma=0.95, hessian="block", stage_weight=[1.0, 0.5, 0.2], solver="daqp"
     )
@@ -162,8 +145,7 @@ def test_the_report_of_a_scheme_with_lags_compares_it_with_the_regulator_of_the_
     assert found.gain_to_lqr < 1e-3  # the horizon is finite
     assert stage_weight(mpc).diagonal().tolist() == pytest.approx([1.0, 0.5, 0.2])
     x, radius = normal(mpc.n_p)[17 * N_D :], found.radius
-    F, G = window_model(A, B)
-    closed = F - G @ found.K[:, 17 * N_D :]
+    closed = A - B @ found.K[:, 17 * N_D :]
     assert (torch.linalg.matrix_power(closed, 50) @ x).norm() < 100 * radius**50
     assert radius == pytest.approx(found.radius_predicted)
     lines = str(found).splitlines()
@@ -178,26 +160,26 @@ def test_the_report_of_a_scheme_with_lags_compares_it_with_the_regulator_of_the_
 # The band
 
 
-def test_the_band_of_a_window_and_a_preview():
+def test_the_band_of_a_preview():
     a, o, b = 3.0, 5.0, 7.0
     expected = torch.tensor(
-        [  # d_0, d_1, d_2, d_3, x_-1, u_-1, x_0, u_0, x_1, u_1, x_2, u_2, x_3
-            [o, a, a, a, o, o, o, o, o, a, a, a, a],
-            [b, o, a, a, b, b, o, o, o, o, o, a, a],
-            [b, b, o, a, b, b, b, b, o, o, o, o, o],
+        [  # d_0, d_1, d_2, d_3, x_0, u_0, x_1, u_1, x_2, u_2, x_3
+            [o, a, a, a, o, o, o, a, a, a, a],
+            [b, o, a, a, b, b, o, o, o, a, a],
+            [b, b, o, a, b, b, b, b, o, o, o],
         ]
     )
     weights = {"c_1": a, "c_2": o, "c_3": b}
-    penalty = DeviationPenalty(torch.zeros(3, 13), 1, 1, past=2, n_d=1, **weights)
+    penalty = DeviationPenalty(torch.zeros(3, 11), 1, 1, n_d=1, **weights)
     assert torch.equal(penalty.C_mask, expected)
-    mpc = QPMPC.of(1, 1, 3, past=2, n_d=1)
+    mpc = QPMPC.of(1, 1, 3, n_d=1)
     assert torch.equal(DeviationPenalty.of(mpc, **weights).C_mask, expected.double())
     with torch.no_grad():
-        mpc.C += torch.arange(39).view(3, 13)
+        mpc.C += torch.arange(33).view(3, 11)
     found = distance_by_band(mpc)
     for name, weight in (("on", o), ("above", a), ("below", b)):
         where = expected == weight
-        assert found[name] == torch.arange(39).view(3, 13)[where].sum()
+        assert found[name] == torch.arange(33).view(3, 11)[where].sum()
     distance = band_distance(LAYOUT)
     C = banded_matrix(A, B, N, E)
     assert (C[distance != 0] == 0).all()
@@ -213,51 +195,50 @@ def test_figures_are_drawn_and_labelled():
     for axes in figure.axes:
         if axes.images:
             labels = {x.get_text() for x in axes.get_xticklabels()}
-            assert {"$d_{0}$", "$x_{-2}$"} <= labels
+            assert {"$d_{0}$", "$x_{0}$"} <= labels
             assert np.isfinite(image_of(axes)).all()
     rendered(figure)
 
 
 def test_a_map_is_one_of_x_0():
-    mpc, grid, first = scheme(), torch.linspace(-1, 1, 3), LAYOUT.n_before
+    mpc, grid, first = scheme(), torch.linspace(-1, 1, 3), LAYOUT.n_preview
     found = policy_map(mpc, grid, grid)
     assert (found.axes, found.names) == ((first, first + 1), ("x_{0,1}", "x_{0,2}"))
     assert (found.states[..., :first] == 0).all()
     assert_close(found.actions[1, 2], mpc.policy(found.states[1, 2]).detach())
     assert policy_figure(found).axes[0].get_xlabel() == "$x_{0,1}$"
-    other = policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview + N_X))
-    assert other.names == ("d_{0,2}", "u_{-2,1}")
-    with pytest.raises(QPError, match=r"axes: got \(12, 13\), expected two different states"):
-        policy_map(QPMPC.of(1, 1, 3, past=5, n_d=1), grid, grid)
+    assert policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview)).names == ("d_{0,2}", "x_{0,1}")
+    with pytest.raises(QPError, match=r"axes: got \(4, 5\), expected two different states"):
+        policy_map(QPMPC.of(1, 1, 3, n_d=1), grid, grid)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (
-            lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, L, N_D),
-            r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 20",
+            lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, N_D),
+            r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 14",
         ),
         (
-            lambda: read(scheme(), (A[:, :N_X], B)),
-            r"true_model's A: got shape \(2, 2\), expected shape \(2, 6\)",
+            lambda: read(scheme(), (A[:, :1], B)),
+            r"true_model's A: got shape \(2, 1\), expected shape \(2, 2\)",
         ),
         (lambda: read(scheme(), (A, B, OFFSET, E[:, :1])), r"true_model's E: got shape \(2, 1\)"),
         (
             lambda: read(scheme(), at=torch.zeros(2)),
-            r"at: got shape \(2,\), expected shape \(20,\)",
+            r"at: got shape \(2,\), expected shape \(14,\)",
         ),
         (
             lambda: one_step_error(nearest_model(model()), A, B, E=E[:, :1]),
             r"E: got shape \(2, 1\), expected shape \(2, 2\)",
         ),
         (
-            lambda: canonical_matrix(model(), torch.zeros(N, N_X, N_X)),
-            r"A: got shape \(5, 2, 2\), expected shape \(5, 2, 6\)",
+            lambda: canonical_matrix(model(), torch.zeros(N, N_X, 1)),
+            r"A: got shape \(5, 2, 1\), expected shape \(5, 2, 2\)",
         ),
         (
-            lambda: DeviationPenalty(torch.zeros(3, 13), 1, 1, past=0),
-            "past: got 0, expected a whole number >= 1",
+            lambda: DeviationPenalty(torch.zeros(3, 11), 1, 1, n_d=-1),
+            "n_d: got -1, expected a whole number >= 0",
         ),
         (
             lambda: second_moment(normal(4, 2), normal(4, 1), normal(3, 1)),
