@@ -180,7 +180,7 @@ def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
     """Return the cost of (p, u_0) in a scheme's first stage, with the price of its soft bounds."""
     layout, theta = scheme.layout, scheme.theta
     kept = torch.cat(
-        (torch.arange(layout.n_d), torch.arange(layout.n_before, layout.n_p + layout.n_u))
+        (torch.arange(layout.n_d), torch.arange(layout.n_preview, layout.n_p + layout.n_u))
     )
     blocks = tuple(theta[name] for name in ("H", "H_f") if name in theta)
     one = torch.ones(layout.n_z, dtype=torch.float64)
