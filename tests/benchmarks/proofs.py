@@ -1,7 +1,6 @@
 """Worst cases of policies beside a million samples: effort, and the size at which it is too much.
 
-    python -m tests.benchmarks.proofs --problems 'double integrator' --horizons 3 --write
-    python -m tests.benchmarks.proofs --problems 'point mass' --write
+    python -m tests.benchmarks.proofs --write
 
 Each row asks for the largest violation of the state's bounds from a box of starts, with noise, and
 attacks the bound by a million starts with noise at its corners, and by gradient ascent from the
@@ -40,18 +39,6 @@ class Problem(NamedTuple):
     bound: np.ndarray
 
 
-def double_integrator(horizon: int, structure: str) -> Problem:
-    """Position and velocity, bounded and soft; every start of the whole box of bounds."""
-    A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
-    bound = np.array([1.0, 0.5])
-    bounds = {"state_bounds": (-bound, bound), "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
-    weight = [1.0, 1.0, 0.1]
-    mpc = QPMPC.linear_mpc(A, B, horizon, stage_weight=weight, structure=structure, **bounds)
-    _disturb(mpc)
-    noise = Polytope.box([-0.02, -0.02], [0.02, 0.02])
-    return Problem(mpc, Plant.of(A, B, disturbances=noise), Polytope.box(-bound, bound), bound)
-
-
 def point_mass(horizon: int, structure: str) -> Problem:
     """The paper's point mass; starts within half of the bounds."""
     physics = PointMass()
@@ -77,9 +64,6 @@ def _disturb(mpc: QPMPC) -> None:
         with torch.no_grad():
             noise = torch.randn(mpc.C.shape, generator=torch.Generator().manual_seed(0))
             mpc.C.add_(0.01 * noise)
-
-
-PROBLEMS = {"double integrator": double_integrator, "point mass": point_mass}
 
 
 def attack(problem: Problem, steps: int) -> float:
@@ -117,9 +101,9 @@ def attack(problem: Problem, steps: int) -> float:
     return worst
 
 
-def measured(name: str, horizon: int, structure: str, steps: int) -> list[str]:
+def measured(horizon: int, structure: str, steps: int) -> list[str]:
     """Measure one row of the table."""
-    problem = PROBLEMS[name](horizon, structure)
+    problem = point_mass(horizon, structure)
     problem.mpc.policy(torch.zeros(len(problem.bound)).double())  # compiles, once
     began = time.process_time()
     try:
@@ -136,7 +120,7 @@ def measured(name: str, horizon: int, structure: str, steps: int) -> list[str]:
         answer = None
     seconds = time.process_time() - began
     return [
-        f"{name}, N = {horizon}, {structure}",
+        f"point mass, N = {horizon}, {structure}",
         str(steps),
         f"{answer.value:.4f}" if answer else "-",
         f"{answer.bound:.4f}" if answer else "-",
@@ -147,25 +131,22 @@ def measured(name: str, horizon: int, structure: str, steps: int) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the tables, or write them into the docs."""
+    """Print the table, or write it into the docs."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.proofs", description=__doc__)
-    parser.add_argument("--problems", nargs="*", choices=PROBLEMS, default=list(PROBLEMS))
-    parser.add_argument("--horizons", type=int, nargs="*", default=[3, 5, 10])
+    parser.add_argument("--horizons", type=int, nargs="*", default=[10])
     parser.add_argument("--steps", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--write", action="store_true", help="write the tables into the docs")
+    parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    for name in options.problems:
-        rows: list[list[str]] = []
-        for horizon in options.horizons:
-            for structure in ("tied", "free"):
-                for steps in options.steps:
-                    rows.append(measured(name, horizon, structure, steps))
-                    print(" | ".join(rows[-1]), flush=True)
-        if options.write:
-            text = PAGE.read_text(encoding="utf-8")
-            text = replaced(text, table(TITLES, rows), f"proofs: {name}")
-            PAGE.write_text(text, encoding="utf-8")
+    rows: list[list[str]] = []
+    for horizon in options.horizons:
+        for structure in ("tied", "free"):
+            for steps in options.steps:
+                rows.append(measured(horizon, structure, steps))
+                print(" | ".join(rows[-1]), flush=True)
+    if options.write:
+        text = replaced(PAGE.read_text(encoding="utf-8"), table(TITLES, rows), "proofs")
+        PAGE.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -21,7 +21,7 @@ from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.run_folder import RunFolder, read_metrics, unwritable
 
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "loggers.md"
+PAGE = Path(__file__).parents[2] / "docs" / "guides" / "runs.md"
 
 
 def test_folder_has_everything_logged(tmp_path, monkeypatch):
