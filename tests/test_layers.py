@@ -72,7 +72,7 @@ BUDGET = {
     "experiment": 3848,
     "export": 1427,
     "learning": 2899,
-    "mpc": 5321,
+    "mpc": 5363,
     "proofs": 998,
     "qp": 5811,
     "study": 613,

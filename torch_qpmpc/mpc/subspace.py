@@ -25,6 +25,7 @@ import torch
 from torch_qpmpc.mpc.innovations import Array, Innovations
 from torch_qpmpc.mpc.log import Trajectory, folds
 from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.qp.kernels.linalg import compiled
 
 #: Iterations of expectation maximisation, of a candidate and of the fit, and the gain of the
 #: log-likelihood per step that ends them.
@@ -425,44 +426,85 @@ class _Moments(NamedTuple):
 def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
     """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``; None if all is ``seen``."""
     A, B, C, Q, R, m, P = par
-    G, N, n = len(y), y.shape[1], len(A)
-    g = 1 if seen is None else G
-    m, P = np.broadcast_to(m, (G, n)), np.broadcast_to(P, (g, n, n))
-    prior, post = np.empty((N, G, n)), np.empty((N, G, n))
+    (G, N, n_y), n = y.shape, len(A)
+    there = np.ones((N, 1, n_y)) if seen is None else np.moveaxis(seen, 0, 1).astype(float)
+    g = there.shape[1]
     before, after = np.empty((N, g, n, n)), np.empty((N, g, n, n))
-    same, value, inputs = np.zeros(N, dtype=bool), 0.0, np.moveaxis(v @ B.T, 0, 1)
-    L = inverse = half = Ct = np.zeros(0)
+    L, inverse, half = np.empty((N, g, n, n_y)), np.empty((N, g, n_y, n_y)), np.empty((N, g))
+    steady = N
     for t in range(N):
-        if t:
-            m, P = post[t - 1] @ A.T + inputs[t - 1], A @ after[t - 1] @ A.T + Q
-        prior[t], before[t] = m, P
-        e = y[:, t] - m @ C.T
-        if seen is not None or t < 2 or np.abs(P - before[t - 1]).max() > SAME * np.abs(P).max():
-            if seen is not None:
-                e = np.where(seen[:, t], e, 0.0)
-            Ct = C if seen is None else C * seen[:, t, :, None]
-            V = Ct @ P @ Ct.swapaxes(-1, -2) + R
-            inverse, half = np.linalg.inv(V), np.linalg.slogdet(V)[1].sum() * G / g
-            L = P @ Ct.swapaxes(-1, -2) @ inverse
-            P = P - L @ V @ L.swapaxes(-1, -2)
-            after[t] = (P + P.swapaxes(-1, -2)) / 2
-        else:
-            before[t], after[t], same[t] = before[t - 1], after[t - 1], True
-        post[t] = m + _apply(L, e)
-        value -= (half + (_apply(inverse, e) * e).sum()) / 2
-    x, Ps, cross, J = post, after.copy(), np.empty((N - 1, g, n, n)), np.zeros(0)
-    for t in range(N - 2, -1, -1):
-        if t == N - 2 or not same[t + 1]:
-            J = np.linalg.solve(before[t + 1], A @ after[t]).swapaxes(-1, -2)
-        x[t] += _apply(J, x[t + 1] - prior[t + 1])
-        Ps[t] += J @ (Ps[t + 1] - before[t + 1]) @ J.swapaxes(-1, -2)
-        cross[t] = Ps[t + 1] @ J.swapaxes(-1, -2)
-    return _Moments(np.moveaxis(x, 0, 1), Ps, cross, float(value))
+        before[t] = A @ after[t - 1] @ A.T + Q if t else P
+        change = np.abs(before[t] - before[t - 1]).max()
+        if seen is None and t > 1 and change <= SAME * np.abs(before[t]).max():
+            for part in (before, after, L, inverse, half):
+                part[t:] = part[t - 1]
+            steady = t
+            break
+        Ct = C * there[t, :, :, None]
+        V = Ct @ before[t] @ Ct.swapaxes(-1, -2) + R
+        inverse[t], half[t] = np.linalg.inv(V), np.linalg.slogdet(V)[1]
+        L[t] = before[t] @ Ct.swapaxes(-1, -2) @ inverse[t]
+        P = before[t] - L[t] @ V @ L[t].swapaxes(-1, -2)
+        after[t] = (P + P.swapaxes(-1, -2)) / 2
+    L, y = L * there[..., None, :], np.moveaxis(y, 0, 1) * there
+    moved = np.moveaxis(v @ B.T, 0, 1) + _apply(A @ L, y)[:-1]
+    prior = recursion((A - A @ L @ C)[:-1], moved, np.broadcast_to(m, (G, n)).copy())
+    e = (y - prior @ C.T) * there
+    post = prior + _apply(L, e)
+    value = -(half.sum() * G / g + (_apply(inverse, e) * e).sum()) / 2
+    J = np.linalg.solve(before[1 : steady + 1], A @ after[:steady][: N - 1]).swapaxes(-1, -2)
+    J = J[np.arange(N - 1).clip(max=len(J) - 1)]
+    x = recursion(J[::-1], (post[:-1] - _apply(J, prior[1:]))[::-1], post[-1])[::-1]
+    own = after[:-1] - J @ before[1:] @ J.swapaxes(-1, -2)
+    Ps = spread(J, own, after[-1])
+    return _Moments(np.moveaxis(x, 0, 1), Ps, Ps[1:] @ J.swapaxes(-1, -2), float(value))
 
 
 def _apply(M: Array, x: Array) -> Array:
-    """Return the products of x ``(G, n)`` with matrices of each, or with the one of all."""
-    return x @ M[0].T if len(M) == 1 else (M @ x[..., None])[..., 0]
+    """Return the products of x ``(T, G, n)`` with the matrices of each step ``(T, 1 or G, ..)``."""
+    return np.matmul(M, x[..., None])[..., 0]
+
+
+@compiled
+def recursion(M, c, z):
+    """Return z_0 = z and z_{t+1} = M_t z_t + c_t ``(T + 1, G, n)``; M is ``(T, 1 or G, n, n)``."""
+    T, G, n = c.shape
+    g, out = M.shape[1], np.empty((T + 1, G, n))
+    for i in range(G):
+        for j in range(n):
+            out[0, i, j] = z[i, j]
+    for t in range(T):
+        for i in range(G):
+            for j in range(n):
+                total = c[t, i, j]
+                for k in range(n):
+                    total += M[t, i % g, j, k] * out[t, i, k]
+                out[t + 1, i, j] = total
+    return out
+
+
+@compiled
+def spread(J, own, last):
+    """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, g, n, n)``."""
+    T, g, n, _ = own.shape
+    out, half = np.empty((T + 1, g, n, n)), np.empty((n, n))
+    for i in range(g):
+        for j in range(n):
+            for k in range(n):
+                out[T, i, j, k] = last[i, j, k]
+        for t in range(T - 1, -1, -1):
+            for j in range(n):
+                for k in range(n):
+                    half[j, k] = 0.0
+                    for m in range(n):
+                        half[j, k] += J[t, i, j, m] * out[t + 1, i, m, k]
+            for j in range(n):
+                for k in range(n):
+                    total = own[t, i, j, k]
+                    for m in range(n):
+                        total += half[j, m] * J[t, i, k, m]
+                    out[t, i, j, k] = total
+    return out
 
 
 def _batches(data: Sequence[Signals]) -> list[tuple[Signals, Array | None]]:
