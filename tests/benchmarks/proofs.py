@@ -1,6 +1,6 @@
 """Worst cases of policies beside a million samples: effort, and the size at which it is too much.
 
-    python -m tests.benchmarks.proofs --write
+    python -m tests.benchmarks.proofs
 
 Each row asks for the largest violation of the state's bounds from a box of starts, with noise, and
 attacks the bound by a million starts with noise at its corners, and by gradient ascent from the
@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +20,8 @@ import torch
 from torch_qpmpc import QPMPC, SolverError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.proofs import Plant, Polytope, largest_violation
-from torch_qpmpc.study.markdown import replaced, table
 
 SAMPLES = 1_000_000
-PAGE = Path(__file__).parents[2] / "docs" / "guides" / "prove.md"
 TITLES = ("problem", "steps", "worst case", "bound", "attack", "binaries / nodes", "CPU, s")
 #: Limit of each mixed-integer program.
 SECONDS = 30.0
@@ -131,22 +128,17 @@ def measured(horizon: int, structure: str, steps: int) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the table, or write it into the docs."""
+    """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.proofs", description=__doc__)
     parser.add_argument("--horizons", type=int, nargs="*", default=[10])
     parser.add_argument("--steps", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    rows: list[list[str]] = []
+    print(" | ".join(TITLES))
     for horizon in options.horizons:
         for structure in ("tied", "free"):
             for steps in options.steps:
-                rows.append(measured(horizon, structure, steps))
-                print(" | ".join(rows[-1]), flush=True)
-    if options.write:
-        text = replaced(PAGE.read_text(encoding="utf-8"), table(TITLES, rows), "proofs")
-        PAGE.write_text(text, encoding="utf-8")
+                print(" | ".join(measured(horizon, structure, steps)), flush=True)
     return 0
 
 
