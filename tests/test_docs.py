@@ -131,7 +131,7 @@ def test_the_task_of_the_guide_trains(tmp_path):
 
 @needs_docs
 def test_every_test_that_a_page_names_exists():
-    text = PAGES["docs/reliability/pytorch.md"]
+    text = PAGES["docs/reliability/measured.md"]
     table = text.split("<!-- pytorch -->")[1].split("<!-- /pytorch -->")[0]
     named = re.findall(r"^(\d+)\. `(tests/[\w/]+\.py)::(test_\w+)`$", table, re.MULTILINE)
     assert {number for number, _, _ in named} == {*re.findall(r"\[(\d+)\]", table)}

@@ -2,7 +2,7 @@
 
 A tenth of the states is ten times as large. Where an action of DAQP differs from that of C, the
 exact solution of the active set replaces it. ``--write`` puts the rows into the table of
-docs/reliability/export.md.
+docs/reliability/measured.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch_qpmpc.export.library import Library
 from torch_qpmpc.qp.program import Status as Outcome
 from torch_qpmpc.study.markdown import replaced, table
 
-PAGE = Path(__file__).parents[2] / "docs" / "reliability" / "export.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reliability" / "measured.md"
 #: The bounds on differences of actions, and of values relative to 1 + |V|.
 LARGEST = 1e-6, 1e-8
 CHUNK = 5000

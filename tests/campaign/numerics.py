@@ -20,7 +20,7 @@ from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.solvers import BACKENDS
 
-PAGE = DOCS / "reliability" / "numerics.md"
+PAGE = DOCS / "reliability" / "measured.md"
 #: Step of the finite differences, and a distance to kinks that they do not cross.
 STEP, NEAR = 1e-6, 1e-4
 COUNT, SEEDS = 32, 6

@@ -114,7 +114,7 @@ def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
     text, sweeps = page.read_text(encoding="utf-8"), frame.groupby("sweep")
     tables = [f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in sweeps]
-    page.write_text(replaced(text, "\n\n".join([*tables, CAPTION]), name), encoding="utf-8")
+    page.write_text(replaced(text, "\n\n".join(tables), name), encoding="utf-8")
     _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
     if len({*first["label"]}) <= SIDE_BY_SIDE:
         plots.readme_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
