@@ -67,7 +67,7 @@ LAYERS = {
 BUDGET = {
     ".": 435,
     "analysis": 1152,
-    "control": 4051,
+    "control": 4100,
     "envs": 1534,
     "experiment": 3848,
     "export": 1427,

@@ -16,6 +16,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.control import review, simulation
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.review import Finding, Review
+from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 
@@ -148,6 +149,35 @@ def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake, monkeypatch
     unit = (run.r / mended.r)[0] if design["model"] != changed["model"] else 1.0
     before = replace(mended, y=run.y / unit, u=run.u)
     assert mended.costs(mended.u_s).sum() <= 1.001 * before.costs(mended.u_s).sum()
+
+
+#: A lag that a log has identified, with slow noise that the outputs hardly show.
+NOISY = replace(read_model(LAG), noise=(np.array([[0.02]]), np.eye(1)))
+
+
+def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
+    looped, _ = controller(NOISY, u_bounds=None, y_bounds=None)
+    mpc, x, last, cost = looped.mpc, np.zeros(1), 0.0, 0.0
+    for k in range(150):
+        y = x + (k == 1)  # it begins at rest
+        (u,) = looped.step(y, [0.0])
+        cost += float(y @ y) + 0.1 * (u - last) ** 2
+        x, last = 0.9 * (x + 0.02 * (k == 1)) + 0.5 * u, u
+    tables = make_tables(mpc), make_tables(mpc.targets)
+    linear, noise = LinearLoop.of(mpc, looped.observer, *tables), mpc.design.plant.noise
+    assert noise is not None
+    assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
+    held = 1 + (0.9 * 0.02) ** 2 / (1 - 0.9**2)
+    assert linear.cost_of_noise(mpc.design, noise, active=False) == pytest.approx(held)
+
+
+def test_a_filter_that_takes_noise_for_disturbances_is_named_and_its_remedy_mends_it():
+    fault = made(NOISY)["noise"]
+    assert not fault.ok
+    words = re.fullmatch(r"Slow .*drift={'(disturbance of y1)': (.*)}\)\.", fault.remedy)
+    assert words, fault.remedy
+    assert made(NOISY, filtered={"drift": {words[1]: float(words[2])}})["noise"].ok
+    assert made(replace(NOISY, A=np.array([[1.1]])))["noise"].ok, "it must act"
 
 
 def loop(model, **options):

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_discrete_lyapunov
 
+from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
@@ -69,6 +70,29 @@ class LinearLoop:
         x = np.linalg.solve(np.eye(len(self.A)) - self.A, self.B)[:n]
         m = self.B.shape[1] - 2 * n_y
         return self.plant[2] @ x + np.hstack((np.zeros((n_y, m)), np.eye(n_y), -np.eye(n_y)))
+
+    def cost_of_noise(
+        self, design: Design, noise: tuple[Array, Array], active: bool = True
+    ) -> float:
+        """Return the mean cost of a step under a model's noise; if not ``active``, of u = 0.
+
+        It is inf if the plant or the loop has no steady state.
+        """
+        (_, _, C_c, D_c), (A, _, C), (L, S) = self.controller, self.plant, noise
+        n_y, n = C.shape
+        m = self.B.shape[1] - 2 * n_y
+        N, moves = A @ L, (np.zeros((m, n)), np.zeros((m, n_y)))
+        of_x, last = C, np.zeros((m, n))
+        if active:
+            A, N = self.A, self.B[:, m : m + n_y] + np.pad(N, ((0, len(self.A) - n), (0, 0)))
+            moves = np.hstack((D_c @ C, C_c)), D_c
+            of_x, last = np.pad(C, ((0, 0), (0, len(A) - n))), np.eye(m, len(A), len(A) - m)
+        if not np.abs(np.linalg.eigvals(A)).max() < 1:
+            return np.inf
+        X = solve_discrete_lyapunov(A, N @ S @ N.T)
+        changes = moves[0] - last, moves[1]
+        parts = (design.Q, of_x, np.eye(n_y)), (design.R, *moves), (design.dR, *changes)
+        return float(sum(np.sum(W * (M @ X @ M.T + D @ S @ D.T)) for W, M, D in parts))
 
     def modulus_margin(self) -> float:
         """Return the least distance of the loop's return difference at the inputs from singular.

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, HIDDEN = 0.3, 1e8, 1e-3
+#: The most that a loop may cost under the log's noise, relative to a constant input.
+NOISY = 1.1
 #: An output's weight with a smaller share of the cost does not matter; one that does.
 IDLE, NOTED = 1e-6, 1e-2
 #: Offsets relative to half the distance of an output's bounds.
@@ -173,6 +175,8 @@ def review(
     findings.append(_stability(loop, design.gamma))
     if loop.radius < 1:
         findings += [_margin(loop, law, plan, target), _offset(loop, design)]
+        if design.plant.noise is not None:
+            findings.append(_noise(loop, law, plan, target, design.plant.noise))
     settings = Settings("policy", "float64", "fast", 1)
     tables, state = own_bytes(law, settings.dtype)
     sizes: dict[str, Any] = {
@@ -473,6 +477,27 @@ def _margin(loop: LinearLoop, law: Law, plan: Tables, target: Tables) -> Finding
             remedy = f"Slow the filter down, by qm.Controller(.., noise={{{pairs}}})."
             break
     return Finding("margin", False, numbers, remedy)
+
+
+def _noise(
+    loop: LinearLoop, law: Law, plan: Tables, target: Tables, noise: tuple[Array, Array]
+) -> Finding:
+    """Under the identified noise the loop costs hardly more than a constant input does."""
+    design, cost = law.design, loop.cost_of_noise(law.design, noise)
+    nothing = loop.cost_of_noise(design, noise, active=False)
+    numbers = {"cost of a step": cost, "of a constant input": nothing}
+    if cost <= NOISY * nothing:
+        return Finding("noise", True, numbers)
+    remedy = "Raise dR tenfold."
+    for power in range(1, SLOWEST + 1):
+        drift = law.drift / 10**power
+        slower = LinearLoop.of(law.mpc, kalman(design, law.noise, drift), plan, target)
+        if slower.cost_of_noise(design, noise) <= NOISY * nothing:
+            named = dict(zip(design.disturbances.names, drift.tolist(), strict=True))
+            pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
+            remedy = f"Slow the filter down, by qm.Controller(.., drift={{{pairs}}})."
+            break
+    return Finding("noise", False, numbers, remedy)
 
 
 def _settling(loop: LinearLoop) -> float:
