@@ -106,7 +106,10 @@ def _train(
     released = state is not None and state["arguments"]["structure"] != mpc.structure
     if released:
         mpc.release()
-    learner = make_learner(cfg, operator, done=cfg.release if released else 0)
+    plant = None
+    if identified is not None and cfg.optimizer.name == "closed_loop":
+        plant = identified.simulated(cfg, physics, start.scheme)
+    learner = make_learner(cfg, operator, cfg.release if released else 0, plant)
     replay = make_run_replay(cfg, mpc)
     gate = RunGate(cfg, learner, physics)
     if state is None and mpc is not start:
@@ -173,7 +176,7 @@ def _train(
                 run.log(update_metrics(terms, losses, tally, watch, mpc, learner), update)
             if update == cfg.release:
                 mpc.release()
-                learner = make_learner(cfg, operator, done=update)
+                learner = make_learner(cfg, operator, update, plant)
                 gate.release(learner)
             run.log(gate.judge(update), update)
             last = update == cfg.updates

@@ -77,6 +77,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "first": ("gate=true", "optimizer=adam"),
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton"),
         "data": (*DATA, "+task.start_episodes=2"),
+        "loops": (*DATA, "optimizer=closed_loop"),
     }.items():
         cfg = make_config(
             *SMALL, "updates=2", "task.eval_steps=2", "task.episode_steps=4", *overrides
@@ -97,7 +98,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
     "overrides",
     [
         *((f"constraint={name}",) for name in choices("constraint")),
-        *((f"optimizer={name}", "constraint=deviation") for name in choices("optimizer")),
+        *((f"optimizer={name}", "start=data") for name in choices("optimizer")),
         *((f"task={name}", "+task.id=Pendulum-v1") for name in ("gymnasium", "pendulum")),
         *((f"task={name}",) for name in ("point_mass", "gros_zanon")),
         ("noise=brownian", "noise.std=0", "seed=0", "updates=1", "td_error_clip=null"),
@@ -184,6 +185,10 @@ def test_missing_keys(key):
         ("constraint=mpc constraint.learn=[C,G]", r"got \['C', 'G'\], expected no G. No task has"),
         ("release=10", "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
         ("task.terminal_weight=riccati", "got 'riccati', expected default or identity. The Ricc"),
+        (
+            "optimizer=closed_loop",
+            "optimizer.name: got 'closed_loop', expected another .* add start",
+        ),
         ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
         ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),
         ("rivals=[nobody]", r"rivals: got \['nobody'\], expected .* identification. They are the"),

@@ -23,6 +23,8 @@ from torch_qpmpc.experiment.run_state import resumed
 RUN = (*SMALL, "updates=8", "eval_interval=4", "log_interval=3", "task.episode_steps=10")
 STOP = 5
 SECOND = "optimizer=gauss_newton"
+LOOPS = ("optimizer=closed_loop", "optimizer.loops=2", "optimizer.steps=6", "optimizer.members=2")
+DATA = ("start=data", "start.transitions=200", "constraint=free")
 
 
 @pytest.mark.filterwarnings("ignore:Found an eps value < 0.5")
@@ -34,7 +36,8 @@ SECOND = "optimizer=gauss_newton"
         ("optimizer=adam", "constraint=mpc", "release=7"),
         (SECOND, "constraint=free", "replay=false", "noise=brownian", "steps_per_update=3"),
         (SECOND, "gate=plant", "constraint=mpc", "release=3"),
-        (SECOND, "gate=true", "start=data", "start.transitions=200", "constraint=free"),
+        (SECOND, "gate=true", *DATA),
+        (*LOOPS, "gate=true", *DATA),
         (SECOND, "task=store", "constraint=si", "replay_capacity=40"),
     ],
     ids=" ".join,

@@ -9,7 +9,7 @@ import torch
 import torch_qpmpc as qm
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.closed_loop import _Loops, simulated_plant, stage_cost
+from torch_qpmpc.learning.closed_loop import _Loops, growth, simulated_plant, stage_cost
 from torch_qpmpc.mpc.identification import Identified, identify
 
 
@@ -180,3 +180,41 @@ def test_improve_refuses_a_model_with_known_signals():
     mpc = qm.QPMPC.of(**{**found.arguments, "horizon": 3}, stage_weight=[1.0, 0.1])
     with pytest.raises(QPError, match="plant: got a model with load, expected one without known"):
         qm.improve(mpc, found)
+
+
+def heavy(rng, size):
+    """Noise of unit variance with heavier tails than the normal distribution's."""
+    return rng.standard_t(8, size) / np.sqrt(8 / 6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_that_grows_with_the_action_is_identified(seed):
+    """In both outputs, in any unit; noise that does not grow is constant, with heavy tails, too."""
+    rng = np.random.default_rng(seed)
+    v = rng.uniform(-1, 1, (1500, 3)) * [1.0, 20.0, 0.5]
+    std = np.sqrt(0.5 + 8.0 * v[:, 2] ** 2)
+    e = np.stack((std * heavy(rng, 1500), 1e3 * rng.normal(size=1500), rng.uniform(-1, 1, 1500)), 1)
+    c = growth(e, v)
+    mean = (std**2).mean()
+    np.testing.assert_allclose(c[0, [0, 3]] * mean, [0.5, 8.0], rtol=0.35)
+    assert (c[0, [1, 2]] * (v[:, :2] ** 2).mean(0)).max() < 0.1
+    np.testing.assert_array_equal(c[1:], np.eye(1, 4).repeat(2, 0))
+
+
+def test_simulated_noise_grows_as_the_logs():
+    rng, logs = np.random.default_rng(0), []
+    for _ in range(20):
+        x, u = [rng.normal(size=1)], rng.uniform(-1, 1, (60, 1))
+        for k in range(60):
+            x.append(
+                0.8 * x[-1] + u[k] * (1 + 1.2 * rng.normal(size=1)) + 0.02 * rng.normal(size=1)
+            )
+        logs.append({"y": np.array(x), "u": u})
+    plant = simulated_plant(identify(logs, order=0), lambda p, u: p.sum(-1), members=1)
+    draw = torch.Generator().manual_seed(0)
+    s = plant.starts(draw, 4000)
+    for level in (0.0, 0.5, 1.0):
+        u = torch.full((4000, 1), level).double()
+        after = plant.known(plant.step(s, u, plant.draw(draw, 4000)))
+        e = after - 0.8 * plant.known(s) - u
+        assert e.std().item() == pytest.approx(np.hypot(1.2 * level, 0.02), rel=0.15, abs=0.1)

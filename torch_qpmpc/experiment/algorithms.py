@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
@@ -14,6 +18,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.learning.closed_loop import Descent, SimulatedPlant
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
@@ -24,7 +29,7 @@ from torch_qpmpc.learning.operators import (
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
-from torch_qpmpc.learning.updates import Update, first_order, second_order
+from torch_qpmpc.learning.updates import Update, entries_of_C, first_order, second_order
 from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -69,26 +74,69 @@ def make_operator(mpc: QPMPC) -> QPActorValueOperator:
     return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=ACTIVE_SET)
 
 
-def make_learner(cfg: DictConfig, operator: QPActorValueOperator, done: int = 0) -> Learner:
-    """Make the learner; its rates continue after ``done`` updates."""
+def make_learner(
+    cfg: DictConfig,
+    operator: QPActorValueOperator,
+    done: int = 0,
+    plant: SimulatedPlant | None = None,
+) -> Learner:
+    """Make the learner; its rates continue after ``done`` updates.
+
+    ``plant`` is the identified one, which ``optimizer=closed_loop`` needs.
+    """
     mpc = operator.module
     loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip, weighted=cfg.weighted)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     penalties = make_penalties(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc)
-    if isinstance(optimizer, GaussNewton):
-        update = second_order(mpc, loss_module, optimizer, *penalties)
+    if plant is not None:
+        options = cfg.optimizer
+        descent = Descent(mpc, plant, options.loops, options.steps, options.lr)
+        optimizer = descent.optimizer
+        scheduler = make_scheduler(cfg, optimizer, done)
+        update = closed_loop_update(mpc, descent, scheduler, cfg.seed, *penalties)
     else:
-        update = first_order(mpc, loss_module, optimizer, *penalties)
+        optimizer = make_optimizer(cfg, mpc)
+        scheduler = make_scheduler(cfg, optimizer, done)
+        order = second_order if isinstance(optimizer, GaussNewton) else first_order
+        update = order(mpc, loss_module, optimizer, *penalties)  # pyright: ignore[reportArgumentType]
     return Learner(
         update,
         loss_module,
         operator.get_policy_operator(POLICY_ACTIVE_SET),
         optimizer,
-        make_scheduler(cfg, optimizer, done),
+        scheduler,
         *penalties,
         n_preview=(mpc.horizon + 1) * mpc.n_d,
     )
+
+
+def closed_loop_update(
+    mpc: QPMPC,
+    descent: Descent,
+    scheduler: LambdaLR,
+    seed: int,
+    deviation: DeviationPenalty | None,
+    si: SystemIdentificationPenalty | None,
+) -> Update:
+    """Return an update by the gradient of closed loops, with new loops in each update."""
+
+    def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Any]:
+        entropy = np.random.SeedSequence([seed, scheduler.last_epoch])
+        descent.start(int(entropy.generate_state(1)[0]))
+        penalty: Callable[[QPMPC], Tensor] | None = None
+        if si is not None and windows is not None:
+            penalty = partial(_si_penalty, si, windows)
+        cost = descent.update(penalty)
+        if deviation is not None:
+            share = float(scheduler.get_last_lr()[0] / scheduler.base_lrs[0])
+            deviation.proximal_step_(entries_of_C(mpc), share)
+        return {"loss/closed_loop": cost}, {}
+
+    return update
+
+
+def _si_penalty(si: SystemIdentificationPenalty, windows: Tensor, mpc: QPMPC) -> Tensor:
+    return si(mpc.C, windows, mpc.b.detach())
 
 
 def make_penalties(

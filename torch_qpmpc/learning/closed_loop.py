@@ -11,13 +11,16 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.optimize
+import scipy.special
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LinearLR
 
 from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
@@ -34,6 +37,8 @@ from torch_qpmpc.mpc.subspace import fit_state_space
 STEPS = 1000
 #: The methods that a plant needs.
 METHODS = ("starts", "draw", "noise", "step", "cost")
+#: The level of the test of noise that grows.
+LEVEL = 0.01
 #: Models of an ensemble.
 MEMBERS = 8
 
@@ -43,7 +48,8 @@ class SimulatedPlant:
 
     Loop i runs with model i modulo their number. The state is [xi, xi_f, k]: the model's own
     estimate, which its innovations move, that of the filter, and the step, by which the gains vary.
-    The innovations are drawn from those of the log, scaled to the model's covariance.
+    The innovations are drawn from those of the log, scaled to the model's covariance and its
+    `growth` with the state and the action.
 
     Args:
         models: the plants.
@@ -60,7 +66,8 @@ class SimulatedPlant:
         cost: Callable[[Tensor, Tensor], Tensor],
     ) -> None:
         self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
-        self._residuals = torch.stack([_residuals(model, log) for model in models])
+        noises = zip(*(_noise(model, log) for model in models), strict=True)
+        self._residuals, self._growth = map(torch.stack, noises)
         self._n = self._own.A.shape[-1]
 
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
@@ -69,7 +76,7 @@ class SimulatedPlant:
         x = self._own.x0[torch.arange(count) % len(self._own.x0)]
         seen = self._filter.x0.expand(count, -1)
         e = torch.randn(count, self._residuals.shape[-1], generator=rng, dtype=x.dtype)
-        return self._measured(x, seen, e, k)
+        return self._measured(x, seen, self._own.at("roots", e, k), k)
 
     def known(self, s: Tensor) -> Tensor:
         """Return what the policy sees, ``(count, n)``."""
@@ -87,18 +94,19 @@ class SimulatedPlant:
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """Return the next states."""
-        k = s[:, -1].detach().long() + 1
-        x, seen = self._own.moved(s[:, : self._n], a), self._filter.moved(self.known(s), a)
-        return self._measured(x, seen, nu, k)
+        own, k, x = self._own, s[:, -1].detach().long() + 1, s[:, : self._n]
+        squares = torch.cat((x.new_ones(len(x), 1), x.square(), a.square()), -1)
+        growth = self._growth[torch.arange(len(x)) % len(self._growth)]
+        e = own.at("roots", nu, k) * (growth @ squares[..., None])[..., 0].sqrt()
+        return self._measured(own.moved(x, a), self._filter.moved(self.known(s), a), e, k)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return the costs of a step, ``(count,)``."""
         return self._cost(self.known(s), a)
 
-    def _measured(self, x: Tensor, seen: Tensor, nu: Tensor, k: Tensor) -> Tensor:
+    def _measured(self, x: Tensor, seen: Tensor, e: Tensor, k: Tensor) -> Tensor:
         """Return the states after an output, from their predictions."""
         own, other = self._own, self._filter
-        e = own.at("roots", nu, k)
         error = own.at("C", x) + e - other.at("C", seen)
         x, seen = x + own.at("gains", e, k), seen + other.at("gains", error, k)
         return torch.cat((x, seen, k[:, None].to(x)), -1)
@@ -158,7 +166,14 @@ def _root(V: np.ndarray) -> np.ndarray:
 def simulated_plant(
     identified: Identified, cost: Callable, members: int = MEMBERS, seed: int = 0
 ) -> SimulatedPlant:
-    """Return the model and those of bootstrapped trajectories as a plant, with its filter."""
+    """Return the model and those of bootstrapped trajectories as a plant, with its filter.
+
+    Raises:
+        QPError: the model has known signals.
+    """
+    if known := identified.log.known:
+        got, want = f"a model with {', '.join(known)}", "one without known signals"
+        raise QPError.expected("plant", got, want, "Simulate them in a plant of your own.")
     log, fit = identified.log.trajectories, identified.fit
     rng, models = np.random.default_rng(seed), [fit.model]
     for _ in range(members - 1 if len(log) > 1 else 0):
@@ -167,13 +182,54 @@ def simulated_plant(
     return SimulatedPlant(models, fit.model, log, cost)
 
 
-def _residuals(model: Innovations, log: Sequence[Trajectory]) -> Tensor:
-    """Return the log's innovations in unit covariance."""
-    errors = [model.errors(x.y.numpy(), x.u.numpy(), x.d.numpy(), 1)[:, 0] for x in log]
-    e = np.concatenate(errors)
-    e = e[np.isfinite(e).all(1)]
-    e = e - e.mean(0)
-    return torch.as_tensor(e @ np.linalg.pinv(_root(e.T @ e / len(e)), 1e-9, True))
+def _noise(model: Innovations, log: Sequence[Trajectory]) -> tuple[Tensor, Tensor]:
+    """Return the log's innovations in unit covariance, and the `growth` of their variances."""
+    parts = [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in log]
+    e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
+    v = np.concatenate([np.hstack((model.estimates(*part)[:-1], part[1])) for part in parts])
+    seen = np.isfinite(e).all(1)
+    e, v = e[seen] - e[seen].mean(0), v[seen]
+    c = growth(e, v)
+    e = e / np.sqrt(np.hstack((np.ones((len(v), 1)), v**2)) @ c.T)
+    e = e @ np.linalg.pinv(_root(e.T @ e / len(e)), 1e-9, True)
+    return torch.as_tensor(e), torch.as_tensor(c)
+
+
+def growth(e: np.ndarray, v: np.ndarray) -> np.ndarray:
+    r"""Return how the variances of innovations grow with states and actions.
+
+    The variance of an entry of e is the mean one times ``c_0 + sum_i c_i v_i^2``. The c are of
+    maximum likelihood where a likelihood-ratio test of 1 % rejects a constant variance, else c_0 =
+    1. The statistic is divided by (kurtosis - 1) / 2, which makes it right for other distributions
+    than the normal one.
+
+    Args:
+        e: innovations, ``(m, n_y)``.
+        v: the states and actions before them, ``(m, n)``.
+
+    Returns:
+        c: ``(n_y, 1 + n)``.
+    """
+    m, n = v.shape
+    sizes = np.concatenate(([1.0], (v**2).mean(0)))
+    X = np.hstack((np.ones((m, 1)), v**2)) / np.where(sizes > 0, sizes, 1.0)
+    c = np.eye(1, 1 + n).repeat(e.shape[1], 0)
+    for i, squares in enumerate((e**2).T):
+        if not (mean := squares.mean()) > 0:
+            continue
+        squares = squares / mean
+
+        def loss(z: np.ndarray, squares: np.ndarray = squares) -> tuple[float, np.ndarray]:
+            variance = X @ np.exp(z)
+            slope = (1 - squares / variance) / variance
+            return (np.log(variance) + squares / variance).sum(), np.exp(z) * (slope @ X)
+
+        start = np.full(1 + n, -np.log(1 + n))
+        fit = scipy.optimize.minimize(loss, start, jac=True, bounds=[(-20, 5)] * (1 + n))
+        statistic = (m - fit.fun) / ((squares**2).mean() - 1) * 2
+        if scipy.special.chdtrc(n, max(statistic, 0.0)) < LEVEL:
+            c[i] = np.exp(fit.x) / np.where(sizes > 0, sizes, 1.0)
+    return c
 
 
 def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
@@ -202,13 +258,14 @@ class _Loops:
     """Closed loops with a plant, side by side, that can go on."""
 
     def __init__(self, plant: Any, count: int, seed: int) -> None:
-        self._plant, self._count = plant, count
-        self._rng = torch.Generator().manual_seed(seed)
+        self._plant, self._count, self._rng = plant, count, torch.Generator()
         self._known = getattr(plant, "known", lambda s: s)
-        self.start()
+        self.start(seed)
 
-    def start(self) -> None:
-        """Begin at new first states."""
+    def start(self, seed: int | None = None) -> None:
+        """Begin at new first states, with the noise of a seed or as it goes on."""
+        if seed is not None:
+            self._rng.manual_seed(seed)
         self._s, self.done = self._plant.starts(self._rng, self._count), 0
         self._nu = torch.zeros_like(self._s)
 
@@ -321,17 +378,7 @@ def improve(
     check_whole("window", window, 1)
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
-    leaves = {k: x for k, x in mpc.coordinates().items() if isinstance(x, nn.Parameter)}
-    if not leaves:
-        remedy = "Name parts of theta in its learn."
-        raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
     if isinstance(plant, Identified):
-        if known := plant.log.known:
-            got, remedy = (
-                f"a model with {', '.join(known)}",
-                "Simulate them in a plant of your own.",
-            )
-            raise QPError.expected("plant", got, "one without known signals", remedy)
         plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), members, seed)
     if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
         got = f"{type(plant).__name__}, without {', '.join(missing)}"
@@ -339,27 +386,20 @@ def improve(
     seeds = [int(x) for x in np.random.SeedSequence(seed).generate_state(2)]
     before, on_failure = copy.deepcopy(mpc.state_dict()), mpc.on_failure
 
-    def tried() -> tuple[Tensor, Tensor]:
-        with torch.no_grad():
-            seen, costs = _Loops(plant, held_out, seeds[0]).run(mpc, steps)
-        return seen.flatten(0, 1), costs.mean(0)
+    @torch.no_grad()
+    def tried() -> Tensor:
+        return _Loops(plant, held_out, seeds[0]).run(mpc, steps)[1].mean(0)
 
     mpc.on_failure, curve = "mask", []
     try:
-        seen, old = tried()
-        theta = _Coordinates(mpc, leaves, seen[seen.isfinite().all(1)], rate, updates)
-        batch = _Loops(plant, loops, seeds[1])
+        old = tried()
+        descent = Descent(mpc, plant, loops, steps, rate, window)
+        descent.start(seeds[1])
+        schedule = LinearLR(descent.optimizer, 1.0, 1 / updates, updates)
         for _ in range(updates):
-            mpc.zero_grad()
-            mean = batch.run(mpc, window)[1].mean()
-            curve.append(mean.item())
-            if mean.isfinite():
-                loss = mean if penalty is None else mean + penalty(mpc)
-                (loss / abs(mean.detach())).backward()
-            theta.step()
-            if batch.done >= steps or not mean.isfinite():
-                batch.start()
-        new = tried()[1]
+            curve.append(descent.update(penalty).item())
+            schedule.step()
+        new = tried()
     finally:
         mpc.on_failure = on_failure
         mpc.zero_grad()
@@ -373,46 +413,79 @@ def improve(
     return Improvement(kept, *means, test.interval, held_out, steps, curve)
 
 
-class _Coordinates:
-    """The coordinates of theta, moved by Adam in the units that the signals give them.
+class Descent:
+    """Moves theta along the gradient of the mean cost of closed loops, by Adam.
+
+    Each entry of theta's coordinates has the unit that the signals of the first loops give it.
 
     Args:
-        mpc: the QPMPC.
-        leaves: its learned coordinates by name.
-        seen: [p; u] of closed loops, ``(steps, n_p + n_u)``.
-        rate: the first rate, which falls to zero.
-        updates: the number of steps.
+        mpc, plant, loops, steps, rate, window: as in `improve`.
+
+    Attributes:
+        optimizer: the optimiser, in these units.
+
+    Raises:
+        QPError: ``mpc`` learns nothing.
     """
 
     def __init__(
-        self, mpc: QPMPC, leaves: Mapping[str, Tensor], seen: Tensor, rate: float, updates: int
+        self,
+        mpc: QPMPC,
+        plant: Any,
+        loops: int,
+        steps: int,
+        rate: float,
+        window: int | None = None,
     ) -> None:
-        self._mpc, self._leaves = mpc, leaves
-        sizes = seen.square().mean(0).sqrt()
+        self._mpc, self._loops, self._steps = mpc, _Loops(plant, loops, 0), steps
+        self._window = steps if window is None else window
+        leaves = {k: x for k, x in mpc.coordinates().items() if isinstance(x, nn.Parameter)}
+        if not leaves:
+            remedy = "Name parts of theta in its learn."
+            raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
+        with torch.no_grad():
+            seen = self._loops.run(mpc, steps)[0].flatten(0, 1)
+        sizes = seen[seen.isfinite().all(1)].square().mean(0).sqrt()
         x, u, d = sizes[mpc.n_p - mpc.n_x : mpc.n_p], sizes[mpc.n_p :], sizes[: mpc.n_d]
         z = torch.cat((x, u, d))[mpc.layout.signals()]
         rows, after = (mpc.G.detach() * z).norm(dim=-1), x.repeat(mpc.horizon)
         units = {"A": x[:, None] / x, "B": x[:, None] / u, "E": x[:, None] / d}
         units |= {"C": after[:, None] / z, "b": after, "lb": rows, "ub": rows}
         units["q"] = mpc.quadratic_program().H.detach().abs() @ z
-        self._units = {name: _unit(mpc, name, x, units.get(name)) for name, x in leaves.items()}
-        self._moves = {name: torch.zeros_like(x) for name, x in leaves.items()}
-        self._adam = torch.optim.Adam(self._moves.values(), lr=rate)
-        self._schedule = torch.optim.lr_scheduler.LinearLR(self._adam, 1.0, 1 / updates, updates)
+        self._leaves = list(leaves.values())
+        self._units = [_unit(mpc, name, x, units.get(name)) for name, x in leaves.items()]
+        self._moves = [torch.zeros_like(x) for x in self._leaves]
+        self.optimizer = torch.optim.Adam(self._moves, lr=rate)
 
-    @torch.no_grad()
-    def step(self) -> None:
-        """Move theta along its gradient; one that is not finite moves nothing."""
-        before = {name: move.clone() for name, move in self._moves.items()}
-        for name, move in self._moves.items():
-            gradient = self._leaves[name].grad
-            move.grad = None if gradient is None else gradient * self._units[name]
-        if nn.utils.clip_grad_norm_(self._moves.values(), 1.0).isfinite():
-            self._adam.step()
-        self._schedule.step()
-        for name, leaf in self._leaves.items():
-            leaf.add_(self._units[name] * (self._moves[name] - before[name]))
+    def start(self, seed: int) -> None:
+        """Begin new loops, with first states and noise of a seed."""
+        self._loops.start(seed)
+
+    def update(self, penalty: Callable[[QPMPC], Tensor] | None = None) -> Tensor:
+        """Move theta once; return the mean cost of a step.
+
+        A cost or gradient that is not finite moves nothing.
+
+        Args:
+            penalty: as in `improve`.
+        """
+        self._mpc.zero_grad()
+        mean = self._loops.run(self._mpc, self._window)[1].mean()
+        if mean.isfinite():
+            loss = mean if penalty is None else mean + penalty(self._mpc)
+            (loss / abs(mean.detach())).backward()
+        with torch.no_grad():
+            for move, leaf, unit in zip(self._moves, self._leaves, self._units, strict=True):
+                move.zero_()
+                move.grad = None if leaf.grad is None else leaf.grad * unit
+            if nn.utils.clip_grad_norm_(self._moves, 1.0).isfinite():
+                self.optimizer.step()
+            for move, leaf, unit in zip(self._moves, self._leaves, self._units, strict=True):
+                leaf.add_(unit * move)
         self._mpc.project_()
+        if self._loops.done >= self._steps or not mean.isfinite():
+            self._loops.start()
+        return mean.detach()
 
 
 def _unit(mpc: QPMPC, name: str, leaf: Tensor, unit: Tensor | None) -> Tensor:

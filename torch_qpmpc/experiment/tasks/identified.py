@@ -18,9 +18,10 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
+from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.identification import check_excitation, measured_model
+from torch_qpmpc.mpc.identification import Identified, check_excitation, measured_model
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.log import NEXT, as_log, kept_steps, valid_steps
@@ -43,7 +44,8 @@ class Start(NamedTuple):
     policy holds, by a cost of its own; None for the policy of the fitted cost. ``choice`` is the
     table of starts that it was chosen from, if it was. ``blended`` is the QP's schedule, in the
     place of the model; None without one. ``riccati`` is True if the cost of x_N is the
-    regulator's. ``print`` shows ``cut``, the model, the fit of the cost, and that table.
+    regulator's. ``found`` is the identified model with the outputs of the log. ``print`` shows
+    ``cut``, the model, the fit of the cost, and that table.
     """
 
     log: Any
@@ -57,6 +59,14 @@ class Start(NamedTuple):
     choice: Choice | None = None
     blended: BlendedModel | None = None
     riccati: bool = False
+    found: Identified | None = None
+
+    def simulated(self, cfg: DictConfig, physics: AnyPlant, scheme: Scheme) -> SimulatedPlant:
+        """Return the plant of the models of the log, with the task's own cost if it is known."""
+        assert self.found is not None
+        known = isinstance(physics, LinearSystem)
+        cost = physics.cost if known else stage_cost(scheme)
+        return simulated_plant(self.found, cost, cfg.optimizer.members, cfg.seed)
 
     @property
     def observer(self) -> Innovations | None:
@@ -111,12 +121,15 @@ def identified_start(
     if observed:
         sizes = (physics.n_y, physics.n_d) if isinstance(physics, Plant) else (physics.n_x, 0)
         data = as_log(log, *sizes)
-        check_excitation(data)
-        model, order, *_ = fit_state_space(data.trajectories, order)
-        physics, log = physics.observed(model), estimated(log, model)
     else:
-        model, order = measured_model(log)[0], 0
-    start = Start(log, model, cfg.task.horizon, order, observed, cut=cut)
+        data, order = as_log(log), 0
+    check_excitation(data)
+    fit = fit_state_space(data.trajectories, order)
+    model, order = fit.model, fit.order
+    if observed:
+        physics, log = physics.observed(model), estimated(log, model)
+    found = Identified(model, data, cfg.task.horizon, fit)
+    start = Start(log, model, cfg.task.horizon, order, observed, cut=cut, found=found)
     if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is not None:
         return start
     diagonal = cfg.task.hessian == "diagonal"

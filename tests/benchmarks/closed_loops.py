@@ -1,0 +1,179 @@
+"""`improve` from one log: ``python -m tests.benchmarks.closed_loops``.
+
+Gros and Zanon's system from 500 logged steps of random actions, and controlgym's he2 from 2,000
+(``pip install --no-deps controlgym``). The model, its noise and its filter are identified from the
+log; gradients through closed loops of the model move theta, without a transition of the plant. J is
+that of the plant: on Gros and Zanon's system the cost of a step, after 100 steps, in 32 loops that
+chose nothing; on he2 that of an episode. Finished rows are kept in docs/results/closed_loops.csv;
+the table goes into docs/results/improvement.md. ``--time`` measures a hundred gradients instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import torch
+
+import torch_qpmpc as qm
+from tests.benchmarks import outside
+from tests.benchmarks.improvement import SHORT_EPISODES
+from tests.benchmarks.table import DOCS
+from tests.runs import make_config
+from torch_qpmpc.envs.closed_loop import closed_loop
+from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.start import collect_log
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.identified import identified_start
+from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "closed_loops.csv"
+SEEDS = (1, 2, 3, 4, 5)
+#: The weight of Gros and Zanon's cost, and the price of a violation.
+WEIGHT, PRICE = torch.diag(torch.tensor([1.0, 1.0, 0.5]).double()), 50.0
+
+
+class Case(NamedTuple):
+    """A controller of a model, the model, J on the plant, and how it is improved."""
+
+    mpc: qm.QPMPC
+    model: Any
+    J: Callable[[], float]
+    options: dict[str, Any]
+    transitions: int
+
+
+def gros_zanon(seed: int) -> Case:
+    """Return MPC with a model of 25 episodes of 20 random actions, and the known cost."""
+    cfg = make_config(*SHORT_EPISODES, f"seed={seed}")
+    plant: Any = make_physics(cfg)
+    log = collect_log(cfg, plant)
+    found = qm.identify(log, 10, order=0)
+    mpc = qm.QPMPC.of(
+        **found.arguments,
+        hessian="block",
+        stage_weight=WEIGHT,
+        state_bounds=(plant.lb_s, plant.ub_s),
+        state_slack=PRICE,
+        discount_slack=True,
+        action_bounds=(plant.lb_a, plant.ub_a),
+        structure="tied",
+        learn=("H", "H_f", "q", "lb", "ub", "b"),
+        solver="daqp",
+    )
+
+    def J() -> float:
+        policy = lambda s: mpc.policy(s).detach()  # noqa: E731
+        return closed_loop(policy, plant, steps=400, seed=777).costs[100:].mean().item()
+
+    options = {"updates": 60, "steps": 400, "window": 40, "held_out": 128}
+    return Case(mpc, found, J, options, log.numel())
+
+
+def he2(seed: int) -> Case:
+    """Return MPC of the estimate by a model of 20 episodes, with the cost fitted to the rewards."""
+    id = outside.PLANTS["controlgym he2"].id
+    own = ["start=data", "constraint=fixed", "task.learn_cost=[H,H_f]", "task.gamma=1.0"]
+    own += ["task.terminal_weight=riccati", f"eval_seed={outside.EVAL_SEED}", f"seed={seed}"]
+    cfg = make_config("task=gymnasium", f"task.id={id}", *own)
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    start = identified_start(cfg, physics, log)
+    plant = start.plant(physics)
+    mpc = make_mpc(cfg, plant, start)
+
+    def J() -> float:
+        return evaluate(cfg, warm_policy(mpc), plant).costs.sum(0).mean().item()
+
+    found = qm.identify(log, 10, order=start.order)
+    return Case(mpc, found, J, {"updates": 40}, log.numel())
+
+
+CASES = {"Gros-Zanon": gros_zanon, "controlgym he2": he2}
+
+
+def run(name: str, seed: int) -> dict[str, Any]:
+    """Return the fields of a row."""
+    case = CASES[name](seed)
+    before, began = case.J(), time.process_time()
+    report = qm.improve(case.mpc, case.model, seed=seed, **case.options)
+    seconds = time.process_time() - began
+    J = {"before": before, "after": case.J(), "kept": report.kept}
+    of_model = {"model before": report.before, "model after": report.after}
+    ends = {"transitions": case.transitions, "seconds": round(seconds)}
+    return {"case": name, "seed": seed} | J | of_model | ends
+
+
+def timed() -> float:
+    """Return the CPU seconds of a hundred gradients of 32 loops of 100 steps; N = 10, 8 states."""
+    rng = np.random.default_rng(0)
+    A, B = rng.normal(size=(8, 8)), rng.normal(size=(8, 2))
+    A *= 0.95 / abs(np.linalg.eigvals(A)).max()
+    logs = []
+    for _ in range(20):
+        x, u = [rng.normal(size=8)], rng.uniform(-1, 1, (50, 2))
+        for k in range(50):
+            x.append(A @ x[-1] + B @ u[k] + 0.1 * rng.normal(size=8))
+        logs.append({"y": np.array(x), "u": u})
+    found = qm.identify(logs, 10, order=0)
+    mpc = qm.QPMPC.of(
+        **found.arguments,
+        hessian="block",
+        stage_weight=torch.eye(10).double(),
+        action_bounds=([-1.0] * 2, [1.0] * 2),
+        state_bounds=([-3.0] * 8, [3.0] * 8),
+        structure="tied",
+        learn=("H", "H_f", "q", "b", "lb", "ub"),
+        solver="daqp",
+    )
+    qm.improve(mpc, found, updates=1, held_out=16)  # which compiles
+    began = time.process_time()
+    qm.improve(mpc, found, updates=100, held_out=16)
+    return time.process_time() - began
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.closed_loops")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=[*CASES])
+    parser.add_argument("--time", action="store_true", help="measure a hundred gradients")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the table")
+    options = parser.parse_args(None if arguments is None else list(arguments))
+    torch.set_num_threads(1)
+    if options.time:
+        print(f"{timed():.0f} s")
+        return
+    rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
+    done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
+    for key in ((name, seed) for name in options.cases for seed in options.seeds):
+        if key not in done:
+            rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
+            rows.to_csv(options.results, index=False, float_format="%.6g")
+            print(*row.values(), flush=True)
+    text = options.page.read_text(encoding="utf-8")
+    options.page.write_text(replaced(text, shown(rows), "closed-loops"), encoding="utf-8")
+
+
+def shown(rows: Any) -> str:
+    """Format the medians and the worst seed of each case."""
+    lines = []
+    for name in CASES:
+        own = rows[rows["case"] == name]
+        if len(own):
+            J = [own["before"].median(), own["after"].median(), own["after"].max()]
+            kept = f"{int(own['kept'].sum())} of {len(own)}"
+            ends = [kept, f"{own['transitions'].max():,}", f"{own['seconds'].median():.0f} s"]
+            lines.append([name, *(f"{x:.4g}" for x in J), *ends])
+    head = ["J, medians", "start", "improved", "worst", "kept", "transitions", "CPU"]
+    return table(head, lines)
+
+
+if __name__ == "__main__":
+    main()
