@@ -81,7 +81,7 @@ def quick_exports() -> Iterator[None]:
     """Compile exports without optimisation and once each, and compare them at few states."""
     compile_now = library.compiled
 
-    @functools.lru_cache(maxsize=8)
+    @functools.lru_cache(maxsize=64)
     def once(command: tuple[str, ...], files: tuple[tuple[str, str], ...], flags: tuple[str, ...]):
         return compile_now(dict(files), flags)
 

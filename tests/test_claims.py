@@ -36,7 +36,7 @@ def test_the_campaigns_page_has_every_family():
     page = (ROOT / "docs/reliability/campaign.md").read_text(encoding="utf-8")
     rows = page.split("<!-- campaign-families -->")[1].split("<!-- /campaign-families -->")[0]
     named = [row.split(" | ")[0].removeprefix("| ") for row in rows.splitlines() if row]
-    assert named[2:] == list(FAMILIES)
+    assert sorted(", ".join(named[2:]).split(", ")) == sorted(FAMILIES)
 
 
 def claims(path: Path, command: str, number: str, *, quick: bool = True) -> list[str]:

@@ -14,12 +14,21 @@ from torch import Tensor
 import torch_qpmpc as qm
 from tests.logs import arx_log, room
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.policy import local_gain
+from torch_qpmpc.analysis.plots import episode_figure, plans_along
+from torch_qpmpc.analysis.policy import local_gain, spectral_radius
+from torch_qpmpc.analysis.report import read
+from torch_qpmpc.analysis.structure import prediction_form, second_moment
+from torch_qpmpc.learning.gate import PairedTest
 from torch_qpmpc.mpc.blended import BlendedModel
+from torch_qpmpc.mpc.projections import nearest_psd, nearest_psd_by_sdp
+from torch_qpmpc.mpc.riccati import lqr_gain
+from torch_qpmpc.mpc.tightening import back_off, prediction_covariance, tighten
+from torch_qpmpc.proofs.plant import Plant, Polytope
 
 A, B, E = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], [[0.1], [0.0]]
 COST: Any = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
 S = torch.tensor([[1.0, 0.5]]).double()
+GAIN = torch.tensor(B).double(), torch.tensor([[0.3, 0.2]]).double()
 
 
 @functools.cache
@@ -73,6 +82,15 @@ DIFFERENTIATED: dict[str, tuple[Callable[[Tensor], Tensor], Any]] = {
         [0.3, 0.0],
     ),
     "DeviationPenalty C": (lambda t: qm.DeviationPenalty.of(scheme())(t), scheme().C_0 + 0.1),
+    "target r": (lambda t: linear().target(t).y, [0.3, 0.0]),
+    "nearest_psd H": (nearest_psd, [[1.0, 2.0], [2.0, 1.0]]),
+    "spectral_radius A": (lambda t: spectral_radius(t, *GAIN), A),
+    "second_moment s": (lambda t: second_moment(t, S[:, :1]), S + 0.1),
+    "prediction_covariance W": (
+        lambda t: prediction_covariance(torch.tensor(A).double(), t, 3),
+        [[0.2, 0.1], [0.1, 0.3]],
+    ),
+    "curvature windows": (qm.SystemIdentificationPenalty(1.0).curvature, [[0.3, 0.5]]),
     "SystemIdentificationPenalty C": (
         lambda t: qm.SystemIdentificationPenalty(1.0)(t, torch.ones(4, 17).double()),
         scheme().C_0 + 0.1,
@@ -133,6 +151,27 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     ),
     "C_0": (lambda t: qm.DeviationPenalty(t, 2, 1), scheme().C_0),
     "s": (lambda t: local_gain(scheme(), t), [[1.0, 0.5]]),
+    "observation": (scheme().predict, [[1.0, 0.5]]),
+    "covariances": (lambda t: tighten(model(), t), [[[0.1, 0.0], [0.0, 0.1]]] * 6),
+    "K": (lambda t: tighten(model(), torch.zeros(6, 2, 2).double(), K=t), [[0.1, 0.1]]),
+    "W": (lambda t: back_off(model(structure="tied"), t), [[0.1, 0.0], [0.0, 0.1]]),
+    "W ": (lambda t: lqr_gain(*map(torch.tensor, (A, B)), t), np.eye(3)),
+    "H": (nearest_psd_by_sdp, [[1.0, 2.0], [2.0, 1.0]]),
+    "C ": (lambda t: prediction_form(t, 2, 1), scheme().C_0),
+    "at": (lambda t: read(scheme(), at=t), [0.1, 0.2]),
+    "true_model": (lambda t: read(scheme(), (t, torch.tensor(B))), A),
+    "p": (lambda t: plans_along(scheme(), t), [[1.0, 0.5]]),
+    "times": (lambda t: episode_figure(t, S[:, :1].expand(3, 1), S[:, :1].expand(2, 1)), [0, 1, 2]),
+    "signals": (
+        lambda t: episode_figure(
+            torch.arange(3.0), S[:, :1].expand(3, 1), S[:, :1].expand(2, 1), signals={"d": t}
+        ), [0, 1, 2]
+    ),
+    "differences": (PairedTest().add, [0.1]),
+    "target": (lambda t: qm.GaussNewton(model(learn=["q"])).step(S, S[:, :1], t), [1.0]),
+    "lower": (lambda t: Polytope.box(t, [1.0]), [0.0]),
+    "b": (lambda t: Polytope.of([[1.0], [-1.0]], t), [1.0, 1.0]),
+    "B ": (lambda t: Plant.of(A, t), B),
 }  # fmt: skip
 
 

@@ -102,13 +102,14 @@ def load(folder: Path) -> dict[str, dict[str, Tally]]:
 
 
 def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
-    """Format the table of families; a count that depends on the solver is a range."""
-    lines = []
+    """Format the table of families by their counts; one that depends on the solver is a range."""
+    lines: dict[tuple[str, ...], list[str]] = {}
     for family in FAMILIES:
         of_all = [of_one[family] for of_one in tallies.values() if family in of_one]
         if of_all:
-            lines.append([family, *(spread(of_all, name) for name in OUTCOMES)])
-    return table(["", *OUTCOMES.values()], lines)
+            lines.setdefault((*(spread(of_all, name) for name in OUTCOMES),), []).append(family)
+    rows = [[", ".join(families), *counts] for counts, families in lines.items()]
+    return table(["each of", *OUTCOMES], rows)
 
 
 def spread(tallies: list[Tally], name: str) -> str:

@@ -3,7 +3,7 @@
 Each QP and each random controller is solved again with its data one unit in the last place away,
 and by the linear algebra of other machines, in processes of their own. Rounding may decide nothing:
 the status and the export's acceptance are the same, a value is right, and a first move is within
-`MOVE` of its range. The command prints the seed of each difference, and fails.
+`MOVE` of its range. The command prints the seed of each difference, and fails if there is one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ VARIANTS: dict[str, dict[str, str]] = {
 }
 #: The largest difference of a first move, relative to its range; QPs of a batch; the share of
 #: controllers that is exported.
-MOVE, BATCH, EXPORTED = 1e-6, 8, 10
+MOVE, BATCH, EXPORTED = 1e-6, 32, 50
 #: QPs by name, each with its solver's; and answers by name: of QPs their status and True where they
 #: are wrong, of controllers the first moves and what their export says.
 Cases = dict[str, tuple[str, Case]]
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
         found = [answers(cases, seeds, nudged) for nudged in (False, True)]
         torch.save(found, options.answer / "answers.pt")
         return 0
-    found = {}
+    first, wrong = {}, 0
     with tempfile.TemporaryDirectory() as folder:
         seeds = range(options.seed, options.seed + options.controllers)
         torch.save((drawn(options.count, options.seed), seeds), f"{folder}/cases.pt")
@@ -66,24 +66,26 @@ def main(arguments: list[str] | None = None) -> int:
             command = [sys.executable, "-m", "tests.campaign.rounding", f"--answer={folder}"]
             subprocess.run(command, env=os.environ | VARIANTS[name], check=True)
             plain, nudged = torch.load(f"{folder}/answers.pt", weights_only=False)
-            found |= {name: plain, f"{name}, moved data": nudged}
-    first, *_ = found.values()
-    lines = {name: list(differences(first, other)) for name, other in found.items()}
-    rows = [[name, f"{len(first)}", f"{len(different)}"] for name, different in lines.items()]
-    print(table(["", "answers", "differences"], rows))
-    for name, different in lines.items():
-        for line in different:
-            print(f"{name}: {line}")
-    return int(any(lines.values()))
+            first = first or plain
+            rows = [["", "QPs", "controllers", "differences"]]
+            for label, other in {name: plain, f"{name}, moved data": nudged}.items():
+                lines = list(differences(first, other))
+                qps = sum(len(x) for x, _ in other.values() if isinstance(x, Tensor))
+                rows.append([label, f"{qps:,}", f"{options.controllers}", f"{len(lines)}"])
+                wrong += len(lines)
+                print(*(f"{label}: {line}" for line in lines), sep="\n", flush=True)
+            print(table(rows[0], rows[1:]), flush=True)
+    return int(wrong > 0)
 
 
 def drawn(count: int, seed: int) -> Cases:
     """Draw QPs, equally many of each family, once: what training gives depends on rounding."""
     cases: Cases = {}
-    for k in range(-(-count // (BATCH * len(FAMILIES)))):
+    size = min(BATCH, -(-count // len(FAMILIES)))
+    for k in range(-(-count // (size * len(FAMILIES)))):
         for i, (family, make) in enumerate(FAMILIES.items()):
             solver = list(BACKENDS)[(i + k) % len(BACKENDS)]
-            cases[f"{solver}, {family}, seed {seed + k}"] = solver, make(Draw(seed + k), BATCH)
+            cases[f"{solver}, {family}, seed {seed + k}"] = solver, make(Draw(seed + k), size)
     return cases
 
 

@@ -17,16 +17,17 @@ import torch
 
 import torch_qpmpc as qm
 from tests.control.controllers import load
+from torch_qpmpc.control.exporting import CompiledController
 
 #: The largest difference of inputs, the probabilities of faults, and the length of a manual phase.
 NEAR, DROPOUT, ABSURD, MANUAL = 1e-9, 0.02, 0.01, 50
 VALUES = (np.inf, -np.inf, 3.4e38, -1e300, 1e20)
 
 
-def soak(controller: qm.Controller, steps: int, phases: int, seed: int) -> tuple[float, Counter]:
+def soak(
+    controller: qm.Controller, twin: CompiledController, steps: int, phases: int, seed: int
+) -> tuple[float, Counter]:
     """Return the largest difference of inputs, and counts of codes, faults and manual steps."""
-    with tempfile.TemporaryDirectory() as folder:
-        twin = load(controller.export_c(folder).files, controller)
     design, rng = controller.mpc.design, np.random.default_rng(seed)
     counts, largest = Counter(), 0.0
     plant, rows = design.plant, design.horizon + 1
@@ -92,7 +93,9 @@ def run(made: Mapping[str, Callable[[], qm.LinearMPC]], steps: int) -> dict[str,
     differences = {}
     for i, (name, make) in enumerate(made.items()):
         controller = qm.Controller(make())
-        differences[name], counts = soak(controller, -(-steps // len(made)), 10, i)
+        with tempfile.TemporaryDirectory() as folder:
+            twin = load(controller.export_c(folder).files, controller)
+        differences[name], counts = soak(controller, twin, -(-steps // len(made)), 10, i)
         print(f"{name}: inputs within {differences[name]:.1e}; {dict(counts)}", flush=True)
     return differences
 

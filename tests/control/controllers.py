@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+import tempfile
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,6 +54,22 @@ def load(
     texts = {x.name: x.read_text() for x in files if x.suffix in (".c", ".h")}
     del texts["main.c"]
     return CompiledController(texts, name, dtype, len(controller.u))
+
+
+def exported(
+    make: Callable[..., qm.Controller], **options
+) -> tuple[qm.Controller, CompiledController]:
+    """Return a new controller, and its functions in C, which are exported once for each design."""
+    twin = _exported(make, (*sorted(options.items()),))
+    twin.reset()
+    return make(**options), twin
+
+
+@functools.cache
+def _exported(make: Callable[..., qm.Controller], options: tuple) -> CompiledController:
+    controller = make(**dict(options))
+    with tempfile.TemporaryDirectory() as folder:
+        return load(controller.export_c(folder).files, controller)
 
 
 class Plant(NamedTuple):

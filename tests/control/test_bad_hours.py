@@ -11,7 +11,7 @@ import torch
 
 import torch_qpmpc as qm
 from tests.campaign.soak import soak
-from tests.control.controllers import learned, load
+from tests.control.controllers import exported, learned
 from tests.exported import STRICT, compilers
 from torch_qpmpc.control.law import Outcome
 
@@ -31,17 +31,22 @@ def two_by_two(**options: Any) -> qm.Controller:
     return qm.Controller(qm.LinearMPC(model, 8, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0), **options))
 
 
-def exported(controller: qm.Controller, folder: Any):
-    return load(controller.export_c(folder).files, controller)
+def two_signals() -> qm.Controller:
+    return qm.Controller(learned())
+
+
+def driven() -> qm.Controller:
+    """Return the controller of a plant with a known signal."""
+    options: Any = {"u_bounds": (-9.0, 9.0), "known": ["d"], "E": [[0.1]]}
+    return qm.Controller(qm.LinearMPC(([[0.9]], [[0.25]]), 8, Q=1.0, dR=0.1, **options))
 
 
 # Missing outputs
 
 
 @pytest.mark.parametrize("bad", [None, *BAD])
-def test_a_dropout_is_predicted_through_alike_in_c(tmp_path, bad):
-    controller = tanks(y_bounds=(0.0, 30.0))
-    twin = exported(controller, tmp_path)
+def test_a_dropout_is_predicted_through_alike_in_c(bad):
+    controller, twin = exported(tanks, y_bounds=(0.0, 30.0))
     controller.reset(y={"T": 10.0}, u={"q": 4.0})
     twin.reset([10.0], [4.0])
     x, statuses = np.array([10.0, 10.0]), []
@@ -59,9 +64,8 @@ def test_a_dropout_is_predicted_through_alike_in_c(tmp_path, bad):
 
 
 @pytest.mark.parametrize("bad", [None, *BAD])
-def test_the_other_outputs_correct_the_estimates_while_one_is_missing(tmp_path, bad):
-    controller = two_by_two()
-    twin = exported(controller, tmp_path)
+def test_the_other_outputs_correct_the_estimates_while_one_is_missing(bad):
+    controller, twin = exported(two_by_two)
     before, gain = np.zeros(4), controller.observer.L
     controller.reset([0.0, 0.0])
     twin.reset([0.0, 0.0])
@@ -78,9 +82,8 @@ def test_the_other_outputs_correct_the_estimates_while_one_is_missing(tmp_path, 
 
 
 @pytest.mark.parametrize("y", [None, [None, None], [0.5, None], [0.5, np.inf]])
-def test_the_last_input_stays_until_all_outputs_have_been_seen(tmp_path, y):
-    controller = two_by_two()
-    twin = exported(controller, tmp_path)
+def test_the_last_input_stays_until_all_outputs_have_been_seen(y):
+    controller, twin = exported(two_by_two)
     controller.reset(u=[0.3, 0.4])
     twin.reset(u=[0.3, 0.4])
     numbers = None if y is None else [np.nan if x is None else x for x in y]
@@ -98,9 +101,8 @@ def test_the_last_input_stays_until_all_outputs_have_been_seen(tmp_path, y):
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_absurd_set_points_and_forecasts_hold_the_input_and_the_estimates_go_on(tmp_path, bad):
-    controller = qm.Controller(learned())
-    twin = exported(controller, tmp_path)
+def test_absurd_set_points_and_forecasts_hold_the_input_and_the_estimates_go_on(bad):
+    controller, twin = exported(two_signals)
     controller.reset(y=[0.5], u=[0.1], known=[0.3, 0.2])
     twin.reset([0.5], [0.1], [0.3, 0.2])
     known = np.tile([0.4, 0.2], (5, 1))
@@ -131,10 +133,8 @@ def test_estimates_are_copies():
 
 
 @pytest.mark.parametrize("known", [[8.0], [5.0], [3.4e38], None])
-def test_a_reset_takes_the_known_signals_at_rest(tmp_path, known):
-    options = {"u_bounds": (-9.0, 9.0), "known": ["d"], "E": [[0.1]]}
-    controller = qm.Controller(qm.LinearMPC(([[0.9]], [[0.25]]), 8, Q=1.0, dR=0.1, **options))
-    twin = exported(controller, tmp_path)
+def test_a_reset_takes_the_known_signals_at_rest(known):
+    controller, twin = exported(driven)
     twin.reset([18.0], [5.2], known)
     plausible = known is not None and known[0] < 1e9
     controller.reset(y=[18.0] if plausible else None, u=[5.2], known=known if plausible else [5.0])
@@ -169,9 +169,8 @@ def automatic(controller: qm.Controller, x: Any, twin: Any = None) -> float:
 LOAD = -0.8
 
 
-def test_the_switch_to_automatic_has_no_bump(tmp_path):
-    controller, x = tanks(), np.array([10.0, 10.0])
-    twin = exported(controller, tmp_path)
+def test_the_switch_to_automatic_has_no_bump():
+    (controller, twin), x = exported(tanks), np.array([10.0, 10.0])
     controller.reset(y=[10.0], u=[4.0])
     twin.reset([10.0], [4.0])
     inputs = np.where(np.arange(150) < 145, 4.0, 11.0)
@@ -191,9 +190,8 @@ def test_the_switch_to_automatic_has_no_bump(tmp_path):
 
 
 @pytest.mark.parametrize("u", [[None], [np.nan], [3.4e38], [-np.inf]])
-def test_the_last_input_stands_for_one_that_is_not_known(tmp_path, u):
-    controller = tanks()
-    twin = exported(controller, tmp_path)
+def test_the_last_input_stands_for_one_that_is_not_known(u):
+    controller, twin = exported(tanks)
     controller.reset(y=[10.0], u=[4.0])
     twin.reset([10.0], [4.0])
     numbers = [np.nan if x is None else x for x in u]
@@ -269,14 +267,15 @@ def test_new_bounds_and_weights_keep_the_estimates():
 
 
 def test_c_and_python_do_the_same_in_all_bad_hours():
-    for i, controller in enumerate((two_by_two(y_bounds=(-1.0, 1.0)), qm.Controller(learned()))):
-        difference, counts = soak(controller, 600, 3, i)
+    pairs = exported(two_by_two, y_bounds=(-1.0, 1.0)), exported(two_signals)
+    for i, pair in enumerate(pairs):
+        difference, counts = soak(*pair, 600, 3, i)
         assert difference < 1e-9
         assert min(counts[x] for x in ("dropouts", "absurd values", "MISSING", "INVALID")) > 0
         assert counts["manual steps"] == 150
 
 
-def test_large_estimates_leave_the_same_input_of_each_step(tmp_path):
+def test_large_estimates_leave_the_same_input_of_each_step():
     """Rounding grows fivefold in a step if outputs that do not answer are replayed.
 
     So each step starts from the same estimates.
@@ -290,8 +289,8 @@ def test_large_estimates_leave_the_same_input_of_each_step(tmp_path):
         "y_bounds": (-2.0, 2.0),
         "du_bounds": (-0.4, 0.4),
     }
-    controller = qm.Controller(qm.LinearMPC((A, B, C), 8, Q=1.0, R=0.01, dR=0.1, **bounds))
-    twin = exported(controller, tmp_path)
+    mpc = qm.LinearMPC((A, B, C), 8, Q=1.0, R=0.01, dR=0.1, **bounds)
+    controller, twin = exported(lambda: qm.Controller(mpc))
     size, largest = len(controller.observer.F), 0.0
     for k in range(200):
         y, r = rng.normal(size=1) * (10 if k % 10 == 0 else 1), rng.normal(size=1)
@@ -327,12 +326,18 @@ int main(void)
 """
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """Return a folder with a controller and a driver of its functions."""
+    path = tmp_path_factory.mktemp("c")
+    two_by_two(y_bounds=(-1.0, 1.0)).export_c(path, dtype=request.param)
+    (path / "main.c").write_text(DRIVER)
+    return path
+
+
 @pytest.mark.parametrize("name", compilers())
-def test_compilers_and_sanitizers_say_nothing_of_a_controller(tmp_path, name, dtype):
-    two_by_two(y_bounds=(-1.0, 1.0)).export_c(tmp_path, dtype=dtype)
-    (tmp_path / "main.c").write_text(DRIVER)
-    files = [str(path) for path in sorted(tmp_path.glob("*.c"))]
+def test_compilers_and_sanitizers_say_nothing_of_a_controller(folder, tmp_path, name):
+    files = [str(path) for path in sorted(folder.glob("*.c"))]
     flags = ("-O1", "-Werror", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     command = [*compilers()[name], *STRICT, *flags, *files, "-o", str(tmp_path / "run")]
     built = subprocess.run(command, capture_output=True, text=True, check=False)

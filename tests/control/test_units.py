@@ -21,7 +21,7 @@ def two_by_two(y, u, **options):
     """Return the controller of two coupled signals in units y, with inputs in units u."""
     y, u = np.array(y), np.array(u)
     B = np.array([[0.3, 0.1], [0.05, 0.2]]) * y[:, None] / u
-    weights = {"Q": 1 / y**2, "dR": 0.1 / u**2, "y_slack": 1e3 / y}
+    weights = {"Q": 1 / y**2, "dR": 0.1 / u**2}
     bounds: Any = {"u_bounds": (-3 * u, 3 * u), "y_bounds": (-5 * y, 5 * y)}
     model = np.diag([0.7, 0.8]), B
     return qm.Controller(qm.LinearMPC(model, 10, **{**weights, **bounds, **options}))
@@ -132,6 +132,40 @@ def test_a_remedy_names_a_weight_in_each_input_s_own_unit():
     (fault,) = (x for x in qm.Controller(singular).review().faults if x.name == "cost")
     assert "R={'u1': 0.01, 'u2': 1e-08}" in fault.remedy
     assert controller.review()["cost"].ok
+
+
+@pytest.mark.parametrize(("y", "u", "cost"), [(1.0, 1.0, 1.0), (1e5, 1e-3, 1.0), (1e-4, 1e2, 50.0)])
+def test_the_default_price_of_a_violation_is_a_thousand_stages_in_any_unit(y, u, cost):
+    def price(**options):
+        bounds: Any = {"y_bounds": (-2 * y, 2 * y), "u_bounds": (-3 * u, 3 * u), **options}
+        weights = {"R": 0.1 * cost / u**2, **options}
+        return qm.LinearMPC(([[0.9]], [[0.5 * y / u]]), 5, **{**bounds, **weights}).design.y_slack
+
+    assert np.allclose(price(Q=cost / y**2), 1e3 * (4 + 0.9) / 2 * cost / y)
+    linear = {"linear": {"u1": 7 * cost / u}, "R": None}
+    assert np.allclose(price(**linear), 1e3 * 7 * 3 / 2 * cost / y)
+    assert np.allclose(price(Q=cost / y**2, R=None, y_bounds=None), 1e3 * cost**0.5 / y)
+    assert price(Q=cost / y**2, y_slack=5.0) == 5.0
+
+
+@pytest.mark.parametrize("hard", [False, True])
+@pytest.mark.parametrize("far", [(1e5, 1e-3, 1e4), (1e-4, 1e2, 1e-5)])
+def test_bounds_of_outputs_and_known_signals_in_far_units_change_no_input(tmp_path, hard, far):
+    found = []
+    for y, u, d in ((1.0, 1.0, 1.0), far):
+        options: Any = {"y_slack": np.inf} if hard else {}
+        mpc = qm.LinearMPC(
+            ([[0.9]], [[0.5 * y / u]]), 8, E=[[0.1 * y / d]], known=["d"], Q=1 / y**2,
+            dR=0.1 / u**2, u_bounds=(-u, u), y_bounds=(-2 * y, 2 * y), **options
+        )  # fmt: skip
+        controller, x, inputs = qm.Controller(mpc), 0.0, []
+        for k in range(40):
+            move = controller.step([x], [2.5 * y * (k > 5)], [2 * d * (k > 20)])
+            inputs.append([move[0] / u, controller.status])
+            x = 0.9 * x + 0.5 * y / u * move[0] + 0.2 * y * (k > 20)
+        found.append(inputs)
+        assert controller.export_c(tmp_path).difference is not None
+    assert np.allclose(*found, atol=1e-7)
 
 
 def test_a_plant_without_a_steady_state_is_refused_in_any_unit():

@@ -27,6 +27,7 @@ from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import without_gradients
 
 #: By step, the planned states ``(N + 1, n_y)`` and actions ``(N, n_u)``, as of `QPMPC.predicted`.
 Plans = Mapping[int, tuple[Tensor, Tensor]]
@@ -213,7 +214,7 @@ def _edges(points: Tensor) -> list[float]:
     return [2 * values[0] - middle[0], *middle, 2 * values[-1] - middle[-1]]
 
 
-@torch.no_grad()
+@without_gradients
 def plans_along(mpc: QPMPC, p: Tensor, every: int = 8) -> Plans:
     """Return the QP's plans at every ``every``-th step of an episode.
 
@@ -234,6 +235,7 @@ def plans_along(mpc: QPMPC, p: Tensor, every: int = 8) -> Plans:
     return dict(zip(steps, zip(x, u, strict=True), strict=True))
 
 
+@without_gradients
 def episode_figure(
     times: Tensor,
     y: Tensor,

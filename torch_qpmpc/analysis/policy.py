@@ -16,12 +16,13 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import as_tensor, ungraded
+from torch_qpmpc.mpc.validation import as_tensor, without_gradients
 from torch_qpmpc.qp.solution import QPSolution
 
 GRID_REMEDY = "Pass torch.linspace(lower, upper, n)."
 
 
+@without_gradients
 def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
     """Return K = ``-d pi / d s`` for the active set at s: near s, u_0 = pi(s) - K ds.
 
@@ -32,7 +33,7 @@ def local_gain(mpc: QPMPC, s: Tensor) -> Tensor:
         SolverError: if a QP has no solution, and ``mpc.on_failure`` is ``"raise"``.
     """
     check_kind("mpc", mpc, QPMPC)
-    return _solve_with_gain(mpc, check_tensor("s", ungraded("s", s), mpc.n_p))[1]
+    return _solve_with_gain(mpc, check_tensor("s", s, mpc.n_p))[1]
 
 
 def spectral_radius(A: Tensor, B: Tensor, K: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
-from torch_qpmpc.mpc.validation import check_one_model
+from torch_qpmpc.mpc.validation import check_one_model, without_gradients
 
 #: A, B, offset and E.
 TrueModel = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -90,6 +90,7 @@ class StructureReport:
         return "\n".join(lines)
 
 
+@without_gradients
 def read(
     mpc: QPMPC, true_model: Sequence[Tensor] | None = None, at: Tensor | None = None
 ) -> StructureReport:
@@ -158,6 +159,7 @@ def read(
     )
 
 
+@without_gradients
 def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) -> dict[str, float]:
     """Return the numbers of `read` that measure the distance to an MPC scheme, for logs.
 

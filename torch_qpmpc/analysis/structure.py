@@ -25,6 +25,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import without_gradients
 
 FORM_REMEDY = "Pass torch_qpmpc.analysis.structure.predictions(mpc)."
 #: The largest accepted condition number of C's state columns, after scaling its rows. The relative
@@ -81,6 +82,7 @@ def _check_form(form: PredictionForm) -> None:
     check_tensor("form.Phi", form.Phi, "N n_x", "n_p", batched=False, remedy=remedy)
 
 
+@without_gradients
 def prediction_form(
     C: Tensor, n_x: int, n_u: int, b: Tensor | None = None, n_d: int = 0
 ) -> PredictionForm:
@@ -117,7 +119,7 @@ def prediction_form(
         want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")
     b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c)
-    C, b = (x.detach().to("cpu", torch.float64) for x in (C, b))
+    C, b = (x.to("cpu", torch.float64) for x in (C, b))
     if not (C.isfinite().all() and b.isfinite().all()):
         raise QPError.expected("C, b", "NaN or inf", "finite entries")
     # Rows of unit norm, so that their scale does not affect the condition number.
@@ -136,7 +138,8 @@ def predictions(mpc: QPMPC) -> PredictionForm:
     Raises:
         QPError: if C has no prediction form.
     """
-    return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.n_d)
+    with torch.no_grad():
+        return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.n_d)
 
 
 def canonical(mpc: QPMPC) -> Tensor:

@@ -18,6 +18,8 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 REFERENCES = ("held", "preview")
+#: The default price of a violation by an output's size, relative to a typical stage's cost.
+Y_SLACK = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,8 @@ class Design:
         horizon: N.
         Q, R, dR: the weights, ``(n_y, n_y)`` and ``(m, m)`` twice.
         y_bounds, u_bounds, du_bounds: pairs (lower, upper), infinite where there is none.
-        y_slack: the price of a unit of violation of ``y_bounds``, ``(n_y,)``; inf is hard.
+        y_slack: the price of a unit of violation of ``y_bounds``, ``(n_y,)``; inf is hard, and
+            None becomes `price`.
         linear: known signals, by index, or numbers that multiply inputs, by input.
         references: "held" or "preview".
         disturbances: B_w, C_w and names.
@@ -63,6 +66,8 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
+        if self.y_slack is None:
+            object.__setattr__(self, "y_slack", self.price)
         if (self.y_slack < 0).any():
             got = f"{self.y_slack.tolist()}"
             raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
@@ -83,9 +88,19 @@ class Design:
 
     @property
     def typical(self) -> float:
-        """The cost of a stage that is half of the bounds' distance off the target."""
-        y, u = self.usual, self.scaling.u
-        return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u)
+        """The cost of a stage that is half of the bounds' distance off the target.
+
+        A price that is a known signal counts as one.
+        """
+        y, u, names = self.usual, self.scaling.u, self.plant.inputs
+        prices = {k: 1.0 if isinstance(x, str) else abs(x) for k, x in self.linear.items()}
+        spent = sum(price * u[names.index(name)] for name, price in prices.items())
+        return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u + spent)
+
+    @property
+    def price(self) -> Array:
+        """The default of y_slack, ``(n_y,)``: a usual deviation costs `Y_SLACK` typical stages."""
+        return Y_SLACK * (self.typical or 1.0) / self.usual
 
     @property
     def usual(self) -> Array:

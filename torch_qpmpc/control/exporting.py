@@ -233,7 +233,7 @@ def _course(law: Law, known: Array) -> tuple[Course, Array]:
     size_y, size_u = design.usual, design.scaling.u
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     x, start = at_rest(law.mpc, known)
-    d = known + 0.1 * rng.normal(size=(rows, len(known)))
+    d = known + 0.1 * design.scaling.d * rng.normal(size=(rows, len(known)))
     noise = 0.01 * size_y * rng.normal(size=(COMPARED + 1, len(size_y)))
     r = centre(design, known) + moves * size_y
     ahead = np.arange(COMPARED + 1)[:, None] + np.arange(stages)
@@ -388,7 +388,7 @@ def _main(law: Law, memory: Memory, name: str, dtype: str) -> str:
     middle_y, (y_rest, u_rest) = centre(design, known), memory.rest
     if y_rest is not None or u_rest is not None:
         u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
-        x = plant.at_rest(u, known, y_rest)
+        x = design.scaling.at_rest(plant, u, known, y_rest)
         middle_y = plant.C @ x
     r = middle_y + 0.25 * design.usual
     r = np.tile(law.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))

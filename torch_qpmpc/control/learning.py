@@ -23,6 +23,7 @@ from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import lowered
 from torch_qpmpc.control.observer import SMALL
+from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError, SolverError
@@ -153,9 +154,12 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
 
     model = _state_space(identified, design)
     n, m, n_y, _ = model.sizes
-    balance = np.block([[np.eye(n) - model.A, -model.B], [model.C, np.zeros((n_y, m))]])
-    loads = np.concatenate((model.E @ d.mean(0) + model.offset, middle))
-    x, u = np.split(np.linalg.lstsq(balance, loads, rcond=None)[0], [n])  # at rest in the middle
+    sizes = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
+    own, of_v = sizes.plant(model), np.concatenate((sizes.x, sizes.u))
+    balance = np.block([[np.eye(n) - own.A, -own.B], [own.C, np.zeros((n_y, m))]])
+    loads = np.concatenate((own.E @ (d.mean(0) / sizes.d) + own.offset, middle / sizes.y))
+    rest = of_v * np.linalg.lstsq(balance, loads, rcond=None)[0]
+    x, u = np.split(rest, [n])  # at rest in the middle
     rest = {"x": x, "u": np.clip(u, *design.u_bounds)}
     ends = len(d) - 1
 

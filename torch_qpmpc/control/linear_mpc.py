@@ -26,9 +26,6 @@ from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
 from torch_qpmpc.mpc.state import KIND, check_own, stored
 from torch_qpmpc.qp.program import QuadraticProgram
 
-#: The price of a unit of violation of an output's bound.
-Y_SLACK = 1e3
-
 
 class Target(NamedTuple):
     """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``."""
@@ -63,7 +60,9 @@ class LinearMPC(QPMPC):
         Q, R, dR: weights by name, as a number, a vector or a matrix; zero by default.
         y_bounds, u_bounds, du_bounds: pairs (lower, upper) by name, or one pair; unbounded by
             default. Bounds of inputs and moves are hard.
-        y_slack: the price of a unit of violation of an output's bounds; inf makes them hard.
+        y_slack: the price of a unit of violation of an output's bounds; inf makes them hard. By
+            default a violation by half the distance of the bounds costs 1000 times as much as a
+            stage with all signals that far off the target.
         linear: price times input, as a mapping from inputs to numbers or names of known signals.
         references: ``"held"``: one r for the plan. ``"preview"``: one for each stage.
         disturbances: those that an observer estimates, by default one for each output; see
@@ -108,7 +107,7 @@ class LinearMPC(QPMPC):
         y_bounds: Any = None,
         u_bounds: Any = None,
         du_bounds: Any = None,
-        y_slack: Any = Y_SLACK,
+        y_slack: Any = None,
         linear: Mapping[str, str | float] | None = None,
         references: str = "held",
         disturbances: Any = "auto",
@@ -325,7 +324,7 @@ def read_wishes(plant: StateSpace, **wishes: Any) -> dict[str, Any]:
         "Q": lambda name, value: read_weight(name, value, y),
         "R": lambda name, value: read_weight(name, value, u),
         "dR": lambda name, value: read_weight(name, value, u),
-        "y_slack": lambda name, value: read_vector(name, value, y, 0.0),
+        "y_slack": lambda name, value: None if value is None else read_vector(name, value, y, 0.0),
         "y_bounds": lambda name, value: read_bounds(name, value, y),
         "u_bounds": lambda name, value: read_bounds(name, value, u),
         "du_bounds": lambda _, value: read_moves(value, u),

@@ -45,8 +45,9 @@ SCALE = 1e-2
 ON_CIRCLE = 1e-6
 #: The weight of small inputs among those with the same outputs, relative to the outputs'.
 PREFERENCE = 1e-8
-#: The price of a hard bound of an output, which a disturbance may make impossible to keep.
-HARD = 1e6
+#: The price of a hard bound of an output, which a disturbance may make impossible to keep, relative
+#: to the default one.
+HARD = 1e3
 #: The price of a bound of u_s that a load or rounding may make impossible to keep, in units of the
 #: cost's slope.
 NEARLY_HARD = 1e3
@@ -213,7 +214,7 @@ def target_mpc(design: Design) -> QPMPC:
     if np.linalg.matrix_rank(steady.U / u[:, None], RANK) < len(u):
         # The plant integrates, and a load may have no steady inputs within bounds.
         price[:] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
-    slack = np.append(price, np.minimum(design.y_slack, HARD)[soft])
+    slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[soft])
     D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
     lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
     weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]

@@ -10,7 +10,6 @@ from scipy.linalg import block_diag
 
 from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.disturbance import check_observable
-from torch_qpmpc.control.scaling import ranges
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 
@@ -118,18 +117,12 @@ def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
 
     They are `ABSURD` times a usual size. An output's is the largest of its bounds, its usual
     deviation, ``noise`` over `SMALL`, and its response to a step of the inputs within the horizon.
-    A known signal's is one, or the size that moves the state as the inputs do if that is more.
     Known signals that move no state are not limited.
     """
     sizes_y = np.maximum(largest(design.y_bounds), design.usual)
-    sizes_u = np.maximum(largest(design.u_bounds), ranges(design.u_bounds))
-    sizes_u = np.where(sizes_u > 0, sizes_u, 1.0)
-    plant, x = design.plant, design.plant.B * sizes_u
-    usual, moved = np.maximum(sizes_y, noise / SMALL), np.linalg.norm(x)
+    plant, sizes_u = design.plant, np.maximum(largest(design.u_bounds), design.scaling.u)
+    usual, x = np.maximum(sizes_y, noise / SMALL), plant.B * sizes_u
     for _ in range(design.horizon):
         usual = np.maximum(usual, np.abs(plant.C @ x).max(1))
         x = plant.A @ x
-    effects = np.linalg.norm(plant.E, axis=0)
-    with np.errstate(divide="ignore"):
-        known = np.where(effects > 0, np.maximum(1.0, moved / effects), np.inf)
-    return ABSURD * usual, ABSURD * known
+    return ABSURD * usual, ABSURD * np.where(plant.E.any(0), design.scaling.d, np.inf)

@@ -419,11 +419,12 @@ def _reach(setting: Setting) -> tuple[Array, Array]:
     design = setting.mpc.design
     steady, loads = design.steady, np.concatenate((setting.w, setting.known, [1.0]))
     lower, upper = (side - steady.u @ loads for side in design.u_bounds)
-    rows = np.vstack((steady.U, -steady.U))
-    limits = np.concatenate((upper, -lower))
+    of_y, of_u, *_ = design.scaling
+    rows = np.vstack((steady.U, -steady.U)) / np.tile(of_u, 2)[:, None]
+    limits = np.concatenate((upper, -lower)) / np.tile(of_u, 2)
     kept = np.isfinite(limits)
     ends = []
-    for y in steady.Y:
+    for y in steady.Y / of_y[:, None]:
         both = []
         for sign in (1, -1):
             least = scipy.optimize.linprog(
@@ -432,7 +433,7 @@ def _reach(setting: Setting) -> tuple[Array, Array]:
             otherwise = np.nan if least.status == 2 else -sign * np.inf  # infeasible, or unbounded
             both.append(sign * least.fun if least.status == 0 else otherwise)
         ends.append(both)
-    ends = np.array(ends).T + steady.y @ loads
+    ends = np.array(ends).T * of_y + steady.y @ loads
     return ends[0], ends[1]
 
 

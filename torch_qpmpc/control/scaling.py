@@ -13,6 +13,8 @@ from torch_qpmpc.control.state_space import Array, StateSpace
 
 #: The fewest steps of the responses that sizes follow from.
 STEPS = 20
+#: Weight of outputs beside an input that is at rest with them: it decides for integrators.
+FAINT = 1e-6
 Bounds = tuple[Array, Array]
 
 
@@ -78,6 +80,22 @@ class Scaling(NamedTuple):
             noise = noise[0] * (y / x[:, None]), noise[1] / y / y[:, None]
         names = plant.inputs, plant.outputs, plant.known
         return StateSpace(*matrices, None, *names, noise=noise)
+
+    def at_rest(
+        self, plant: StateSpace, u: Array, d: Array, y: Array | None = None, weight: float = 1.0
+    ) -> Array:
+        """Return the state ``(n,)`` that rests with the input u and the known signals d.
+
+        With outputs y it is as near to rest, and to y with a weight, as least squares allow: the
+        input alone does not determine the outputs of a plant that integrates, or nearly so.
+        """
+        normal = self.plant(plant)
+        still = np.eye(len(normal.A)) - normal.A
+        driven = normal.B @ (u / self.u) + normal.E @ (d / self.d) + normal.offset
+        if y is not None:
+            still = np.vstack((still, weight * normal.C))
+            driven = np.concatenate((driven, weight * y / self.y))
+        return self.x * np.linalg.lstsq(still, driven, rcond=None)[0]
 
 
 def ranges(bounds: Bounds) -> Array:

@@ -13,14 +13,8 @@ from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, middle
 from torch_qpmpc.control.law import Law, Memory, Move, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.state_space import (
-    FAINT,
-    Array,
-    StateSpace,
-    read_model,
-    read_row,
-    read_vector,
-)
+from torch_qpmpc.control.scaling import FAINT, Scaling
+from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.loops import Step, run_loop
 
@@ -188,7 +182,7 @@ def _first(target: torch.Tensor) -> Array:
 class _Model:
     """A model with Gymnasium's ``reset`` and ``step``, which starts at rest with the input u.
 
-    With outputs y it starts as near to them, with a weight, as `StateSpace.at_rest` says.
+    With outputs y it starts as near to them, with a weight, as `Scaling.at_rest` says.
     """
 
     def __init__(
@@ -209,7 +203,8 @@ class _Model:
         if self._d.shape[1] != len(model.known):
             got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
             raise QPError.expected("plant", got, want)
-        rest = model.at_rest(u, self._d[0], y, weight)
+        scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
+        rest = scaling.at_rest(model, u, self._d[0], y, weight)
         states = [f"x{i + 1}" for i in range(len(model.A))]
         self._start = rest if x is None else read_vector("x", x, states, 0.0)
 
@@ -238,7 +233,7 @@ def centre(design: Design, known: Array) -> Array:
     """
     half, (lower, upper) = design.scaling.u, design.u_bounds
     u, y = np.clip(0.0, lower + half, upper - half), middle(design.y_bounds)
-    held = design.plant.C @ design.plant.at_rest(u, known, y, FAINT)
+    held = design.plant.C @ design.scaling.at_rest(design.plant, u, known, y, FAINT)
     return np.where(np.isfinite(design.y_bounds).all(0), y, np.clip(held, *design.y_bounds))
 
 

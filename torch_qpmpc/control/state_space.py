@@ -16,8 +16,6 @@ from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
 Array = np.ndarray
 WANTED = "(A, B), (A, B, C_y), a control.StateSpace, scipy's dlti, or an identification"
-#: Weight of outputs beside an input that is at rest with them: it decides for integrators.
-FAINT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,18 +64,6 @@ class StateSpace:
     def sizes(self) -> tuple[int, int, int, int]:
         """n, m, n_y and n_d."""
         return len(self.A), self.B.shape[1], len(self.C), self.E.shape[1]
-
-    def at_rest(self, u: Array, d: Array, y: Array | None = None, weight: float = 1.0) -> Array:
-        """Return the state ``(n,)`` that rests with the input u and the known signals d.
-
-        With outputs y it is as near to rest, and to y with a weight, as least squares allow: the
-        input alone does not determine the outputs of a plant that integrates, or nearly so.
-        """
-        still, driven = np.eye(len(self.A)) - self.A, self.B @ u + self.E @ d + self.offset
-        if y is not None:
-            still = np.vstack((still, weight * self.C))
-            driven = np.concatenate((driven, weight * y))
-        return np.linalg.lstsq(still, driven, rcond=None)[0]
 
     def label(self, name: str) -> str:
         """Return ``name`` with its unit, as ``T [degC]``."""

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_number, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.validation import without_gradients
 
 #: Maps a policy and a seed to the costs of closed loops.
 Costs = Callable[[nn.Module, int], Tensor]
@@ -76,6 +77,7 @@ class PairedTest:
             check_number("bound", bound, lambda x: 0 < x < math.inf, "a positive loss of one pair")
         self.alpha, self._given, self._d = alpha, bound, np.zeros(0)
 
+    @without_gradients
     def add(self, differences: Tensor) -> None:
         """Add the differences ``(n,)`` of new pairs; an infinite one decides, as does a NaN.
 
@@ -83,7 +85,7 @@ class PairedTest:
             QPError: the shape does not fit.
         """
         check_tensor("differences", differences, len(differences), batched=False)
-        new = differences.detach().double().cpu().numpy()
+        new = differences.double().cpu().numpy()
         self._d = np.concatenate((self._d, new))
 
     @property

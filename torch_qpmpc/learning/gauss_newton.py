@@ -34,6 +34,7 @@ from torch_qpmpc.learning.kernel import (
 from torch_qpmpc.learning.td_error import inverse_variance, usable
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
+from torch_qpmpc.mpc.validation import without_gradients
 from torch_qpmpc.qp.derivatives import envelope_gradients
 from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
@@ -140,7 +141,7 @@ class GaussNewton(torch.optim.Optimizer):
             remedy = "Pass a penalty of its rows to step."
             raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
 
-    @torch.no_grad()
+    @without_gradients
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
         self,
         s: Tensor,

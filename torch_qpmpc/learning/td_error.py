@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torch_qpmpc.mpc.validation import without_gradients
 from torch_qpmpc.qp.tracing import has_values
 
 #: The scalars that describe a batch.
@@ -87,7 +88,7 @@ def invalid_rewards(reward: Tensor, key: object) -> Tensor:
     return invalid
 
 
-@torch.no_grad()
+@without_gradients
 def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Tensor) -> Tensor:
     """Return one over the variance of each TD error, relative to its mean, ``(B,)``.
 

@@ -42,6 +42,7 @@ from torch_qpmpc.mpc.validation import (
     check_one_model,
     check_pair,
     learned_entries,
+    without_gradients,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
@@ -336,7 +337,7 @@ class QPMPC(nn.Module):
         """
         return self._action(self.solve(s, warm_start=warm_start, qp=qp), s.dtype)
 
-    @torch.no_grad()
+    @without_gradients
     def predict(self, observation: Any) -> np.ndarray:
         """Return pi(observation) as an array, without gradients: the action to apply, and no more.
 

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_tensor
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.mpc.validation import without_gradients
 
 CHOLESKY = "cholesky"
 #: Clarabel's full and reduced tolerances, for a program with entries of at most one.
@@ -58,6 +59,7 @@ def nearest_psd(H: Tensor) -> Tensor:
     return _replaced(H, _without_negative_eigenvalues)
 
 
+@without_gradients
 def nearest_psd_by_sdp(H: Tensor) -> Tensor:
     """Return `nearest_psd`, computed as a semidefinite program by Clarabel (eq:sdp1).
 

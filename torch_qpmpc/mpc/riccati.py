@@ -11,7 +11,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.validation import check_weight
+from torch_qpmpc.mpc.validation import check_weight, without_gradients
 
 if TYPE_CHECKING:
     from torch_qpmpc.mpc.module import QPMPC
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 RICCATI = "riccati"
 
 
+@without_gradients
 def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
     """Return K ``(n_u, n_x)`` of the discounted linear quadratic regulator u = -K x.
 
@@ -53,6 +54,7 @@ def stage_weight(mpc: QPMPC) -> Tensor:
     return mpc.quadratic_program().H.detach()[stage, stage]
 
 
+@without_gradients
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
     """Return P ``(n_x, n_x)`` of the discounted linear quadratic regulator's cost to go 1/2 x'Px.
 

@@ -24,6 +24,7 @@ from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_who
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
+from torch_qpmpc.mpc.validation import without_gradients
 
 
 def prediction_covariance(
@@ -57,7 +58,7 @@ def prediction_covariance(
     return torch.stack(covariances)
 
 
-@torch.no_grad()
+@without_gradients
 def tighten(
     mpc: QPMPC, covariances: Tensor, probability: float = 0.95, K: Tensor | None = None
 ) -> None:
@@ -104,7 +105,7 @@ def tighten(
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
 
 
-@torch.no_grad()
+@without_gradients
 def back_off(mpc: QPMPC, W: Tensor, probability: float = 0.95) -> None:
     """Tighten soft rows for a noise of covariance W, and change ``mpc`` in place.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from functools import wraps
+from inspect import signature
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +15,8 @@ from torch_qpmpc.checks import check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import broadcast, to_dtype
 
+P = ParamSpec("P")
+T = TypeVar("T")
 #: In order, from the least tied to the most.
 STRUCTURES = ("free", "varying", "tied")
 #: The parts of theta by family; the paper advises a different learning rate for each.
@@ -85,9 +89,24 @@ def owned(name: str, value: Any) -> Tensor | None:
     return None if value is None else as_tensor(name, value).detach().clone()
 
 
+def without_gradients(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function that refuses tensors that require grad, and runs without gradients."""
+    parameters = signature(function)
+
+    @wraps(function)
+    def run(*args: P.args, **options: P.kwargs) -> T:
+        for name, value in parameters.bind(*args, **options).arguments.items():
+            ungraded(name, value)
+        with torch.no_grad():
+            return function(*args, **options)
+
+    return run
+
+
 def ungraded(name: str, value: Any) -> Any:
     """Return ``value``; raise `QPError` if it is or has a tensor whose gradient would be lost."""
-    parts = value if isinstance(value, list | tuple) else ()
+    parts = value.values() if isinstance(value, dict) else value
+    parts = parts if isinstance(value, dict | list | tuple) else ()
     if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
         remedy = f"Pass {name}.detach(): no gradient flows through this argument."
         raise QPError.expected(name, "a tensor that requires grad", "one without", remedy)

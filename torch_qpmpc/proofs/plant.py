@@ -13,10 +13,15 @@ from scipy.spatial import HalfspaceIntersection, QhullError
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.validation import read_numbers
 
 Array = np.ndarray
 #: Vertices are enumerated up to this dimension, not counting entries that a box fixes.
 MOST_DIMENSIONS = 8
+
+
+def _array(name: str, value: Any) -> Array:
+    return read_numbers(name, value).detach().numpy().copy()
 
 
 def support(A: Array, b: Array, row: Array) -> float:
@@ -45,7 +50,7 @@ class Polytope:
     @classmethod
     def of(cls, A: Any, b: Any) -> Polytope:
         """Make ``{x: A x <= b}``."""
-        A, b = np.array(A, float), np.array(b, float)
+        A, b = _array("A", A), _array("b", b)
         if A.ndim != 2 or b.shape != A.shape[:1]:
             got = f"shapes {A.shape} and {b.shape}"
             raise QPError.expected("A and b of the polytope", got, "(m, n) and (m,)")
@@ -62,7 +67,7 @@ class Polytope:
     @classmethod
     def box(cls, lower: Any, upper: Any) -> Polytope:
         """Make ``{x: lower <= x <= upper}``."""
-        lower, upper = np.array(lower, float), np.array(upper, float)
+        lower, upper = _array("lower", lower), _array("upper", upper)
         if lower.ndim != 1 or lower.shape != upper.shape:
             got = f"shapes {lower.shape} and {upper.shape}"
             raise QPError.expected("lower and upper", got, "(n,) each")
@@ -130,11 +135,11 @@ class Plant:
         Raises:
             QPError: the shapes do not fit.
         """
-        A, B = np.array(A, float), np.array(B, float)
+        A, B = _array("A", A), _array("B", B)
         n = len(A)
-        offset = np.zeros(n) if offset is None else np.array(offset, float)
+        offset = np.zeros(n) if offset is None else _array("offset", offset)
         n_d = 0 if disturbances is None else len(disturbances.lower)
-        E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else np.array(E, float)
+        E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else _array("E", E)
         shapes = A.shape, B.shape[:1], B.ndim, offset.shape, E.shape
         if shapes != ((n, n), (n,), 2, (n,), (n, n_d)):
             got = f"shapes {A.shape}, {B.shape}, {offset.shape} and {E.shape}"
