@@ -66,14 +66,14 @@ LAYERS = {
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 435,
-    "analysis": 1152,
-    "control": 4100,
+    "analysis": 1160,
+    "control": 4115,
     "envs": 1534,
     "experiment": 3925,
     "export": 1427,
-    "learning": 2972,
-    "mpc": 5363,
-    "proofs": 998,
+    "learning": 2976,
+    "mpc": 5388,
+    "proofs": 1003,
     "qp": 5811,
     "study": 613,
 }

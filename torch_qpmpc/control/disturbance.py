@@ -33,6 +33,8 @@ from torch_qpmpc.errors import QPError
 RANK = 1e-9
 #: Weighted outputs whose responses differ by a smaller part of them are one.
 FLAT = RANK**0.5
+#: Sizes that differ by a smaller part of them are equal.
+TIE = 1e-6
 #: A length that is no divisor.
 TINY = 1e-300
 #: Modes this near to one integrate: an output disturbance is hard to tell from their drift.
@@ -153,7 +155,8 @@ def _automatic(plant: StateSpace, tolerance: float) -> dict[str, str]:
 
 
 def _independent(matrix: Array) -> list[int]:
-    """Return columns that are independent of each other, the largest first."""
+    """Return columns that are independent of each other, the largest first, and ties in order."""
+    matrix = matrix * (1 - TIE * np.arange(matrix.shape[1]))
     _, R, order = map(np.asarray, scipy.linalg.qr(matrix, mode="economic", pivoting=True))
     sizes = np.abs(np.diag(R))
     return [int(i) for i, x in zip(order, sizes, strict=False) if x > RANK * sizes[0]]
