@@ -67,14 +67,14 @@ LAYERS = {
 BUDGET = {
     ".": 435,
     "analysis": 1160,
-    "control": 4115,
+    "control": 4140,
     "envs": 1534,
     "experiment": 3925,
     "export": 1427,
     "learning": 2976,
-    "mpc": 5388,
+    "mpc": 5465,
     "proofs": 1003,
-    "qp": 5811,
+    "qp": 5905,
     "study": 613,
 }
 #: Libraries that only some layers may import.

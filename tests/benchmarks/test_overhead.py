@@ -53,7 +53,7 @@ def test_share_outside_the_solver(
 
         return timed_solve
 
-    monkeypatch.setattr(Programs, "try_active_sets", timed(Programs.try_active_sets))
+    monkeypatch.setattr(Programs, "recalled", timed(Programs.recalled))
     monkeypatch.setitem(BACKENDS, solver, timed(BACKENDS[solver]))
     gradient = STARTS[start](
         make_mpc(PAPER, dense=True, solver=solver),

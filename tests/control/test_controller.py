@@ -194,3 +194,45 @@ def test_a_mode_that_no_input_moves_has_no_filter():
     model = read_model((A, [[0.0], [0.0], [1.0]], [[1.0, 0.0, 1.0]]))
     with pytest.raises(QPError, match=r"^model: got a model whose Kalman filter does not converge"):
         qm.Controller(qm.LinearMPC(model, 3, Q=1.0, R=1.0))
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_is_that_of_the_differentiable_parts(seed, references):
+    """Noise, loads and set-points out of reach: target, plan and input of each step."""
+    rng, A, known = np.random.default_rng(seed), np.diag([0.9, 0.7, 0.5]), {}
+    B, C = rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
+    bounds = {"u_bounds": (-0.5, 0.5), "y_bounds": (-1.5, 1.5), "du_bounds": (-0.4, 0.4)}
+    if seed % 2:
+        known = {"E": rng.normal(size=(3, 1)), "known": ["d"]}
+    mpc = qm.LinearMPC((A, B, C), 8, Q=1.0, R=0.1, references=references, **bounds, **known)
+    controller, x, active = qm.Controller(mpc), np.zeros(3), 0
+    for k in range(60):
+        r = (2.0 if k % 20 < 10 else 0.2) * rng.normal(
+            size=(9 if references == "preview" else 1, 2)
+        )
+        d = rng.normal(size=(9, len(known) // 2))
+        u_last, ahead = controller.u, {"known": {"d": d[:, 0]}} if known else {}
+        u = controller.step(C @ x + 0.01 * rng.normal(size=2), r, **ahead)
+        observer, e = controller.observer, controller._memory.e
+        assert e is not None
+        e = np.linalg.solve(observer.F, e - observer.predicted(np.zeros_like(e), u, d[0]))
+        target = mpc.target(r if references == "preview" else r[0], e[3:], d.mean(0))
+        p = mpc.arrange(e[:3], target, u_last=u_last, known=d, level=d.mean(0))
+        plan = mpc.solve(p, warm_start=mpc.solve(p))
+        expected = (target.u[-1] if references == "preview" else target.u) + plan.z[mpc.n_p :][:2]
+        assert controller.status == 0
+        assert np.abs(u - expected.clamp(-0.5, 0.5).numpy()).max() < 1e-7
+        active += int(plan.active.any())
+        x = A @ x + B @ (u + 0.1) + (known["E"] @ d[0] if known else 0)
+    assert active > 20
+
+
+def test_a_healthy_loop_needs_no_refinement():
+    controller = qm.Controller(integrator())
+    closed_loop(controller, [1.0], 5)
+    with qm.SolveLog() as log:
+        closed_loop(controller, [1.0], 40)
+    assert log.solves == 80
+    assert log.refined == log.fallback == log.unsolved == 0
+    assert log.recalled > 70

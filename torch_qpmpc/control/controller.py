@@ -227,7 +227,7 @@ class Controller:
             array([0.2])
         """
         mpc = self.mpc.redesigned(**changes)
-        self._law = replace(self._law, mpc=mpc, qp=mpc.quadratic_program())
+        self._law = replace(self._law, mpc=mpc)
         u = np.clip(self.u, *mpc.design.u_bounds)
         self._memory = self._memory._replace(u=u)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,9 +23,9 @@ from torch_qpmpc.control.observer import (
     max_plausible,
 )
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
-from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.solve import solve
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.qp.pipeline.solve import AtRest
+from torch_qpmpc.qp.program import Status
 
 
 class Memory(NamedTuple):
@@ -92,7 +93,6 @@ class Law:
         noise, drift: standard deviations, ``(n_y,)`` and ``(n_w,)``.
         observer: the observer.
         max_plausible: the largest sizes of outputs and set-points, and of known signals.
-        qp: the plan's QP.
     """
 
     mpc: LinearMPC
@@ -100,7 +100,6 @@ class Law:
     drift: Array
     observer: Observer
     max_plausible: tuple[Array, Array]
-    qp: QuadraticProgram
 
     @classmethod
     def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None) -> Law:
@@ -119,16 +118,26 @@ class Law:
         drift = _deviations("drift", drift, drifts * design.of_w(design.usual), w.names)
         observer = kalman(design, noise, drift)
         largest = max_plausible(design, noise)
-        return cls(mpc, noise, drift, observer, largest, mpc.quadratic_program())
+        return cls(mpc, noise, drift, observer, largest)
 
     @property
     def design(self) -> Design:
         """The design of the MPC."""
         return self.mpc.design
 
+    @cached_property
+    def plans(self) -> AtRest:
+        """The solver of the plan's QP, with the theta of its first use."""
+        return self.mpc.at_rest()
+
+    @cached_property
+    def aims(self) -> list[AtRest]:
+        """The solvers of the target's QPs."""
+        return [x.at_rest() for x in (self.mpc.targets, self.mpc.free) if x is not None]
+
     def renewed(self) -> Law:
         """Return the law with today's theta."""
-        return replace(self, qp=self.mpc.quadratic_program())
+        return replace(self)
 
     def begun(self, u: Array | None = None) -> Memory:
         """Return a memory without a past, with the last input u, by default zero, in its bounds."""
@@ -153,20 +162,35 @@ class Law:
         if e is None or status == Outcome.INVALID or not valid:
             return Move(memory.u, self._after(memory, e, memory.u), Outcome.INVALID)
         x, w = np.split(e, [len(design.plant.A)])
-        previewed, level = design.references == "preview", known.mean(0)
-        mpc, kept, held = self.mpc, self.mpc.n_p + self.mpc.n_u, self._after(memory, e, memory.u)
-        try:
-            target = mpc.target(r if previewed else r[0], w, level)
-        except SolverError:
-            return Move(memory.u, held, Outcome.INFEASIBLE)
+        mpc, held, level = self.mpc, self._after(memory, e, memory.u), known.mean(0)
+        previewed, aimed = design.references == "preview", []
+        for row in r if previewed else r[:1]:
+            if (target := self._aimed(row, w, level)) is None:
+                return Move(memory.u, held, Outcome.INFEASIBLE)
+            aimed.append(target)
+        target = Target(*map(torch.stack, zip(*aimed, strict=True))) if previewed else aimed[0]
         p = mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
-        plan = solve(self.qp, p.to(self.qp.q.dtype), kept, mpc.solver, "mask", None)
-        if plan.status != Status.SOLVED:
-            proved = plan.status == Status.INFEASIBLE
+        plan = self.plans.solve(p.numpy()[None])
+        if plan.status[0]:
+            proved = plan.status[0] == Status.INFEASIBLE
             return Move(memory.u, held, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
-        u = (target.u[-1] if previewed else target.u) + plan.z[mpc.n_p : kept].cpu()
-        u = np.clip(u.numpy(), *design.u_bounds)
+        u = aimed[-1].u.numpy() + plan.z[0, mpc.n_p : mpc.n_p + mpc.n_u]
+        u = np.clip(u, *design.u_bounds)
         return Move(u, self._after(memory, e, u), status, target, p)
+
+    def _aimed(self, r: Array, w: Array, level: Array) -> Target | None:
+        """Return `LinearMPC.target` of one set-point; None if a QP has no solution."""
+        steady, loads = self.design.steady, np.concatenate((w, level, [1.0]))
+        v, known = np.zeros(0), r
+        for aims in self.aims:
+            state = np.concatenate((known, loads))
+            solution = aims.solve(state[None])
+            if solution.status[0]:
+                return None
+            known = solution.z[0, len(state) : -len(state)]
+            v = np.concatenate((v, known))
+        pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
+        return Target(*(torch.from_numpy(Z @ v + M @ loads) for Z, M in pairs))
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.

@@ -125,7 +125,7 @@ def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, 
     signals = torch.eye(n + n_w + m + n_y, dtype=torch.float64)
     signals = torch.cat((torch.zeros_like(signals[:1]), signals))
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
-    s = torch.cat((r, w, r.new_zeros(len(r), n_d)), -1)
+    s = torch.cat((r, w, r.new_zeros(len(r), n_d), r.new_ones(len(r), 1)), -1)
     a = s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
     # Without bounds the free inputs are least: f = 0.
     f = a.new_zeros(len(a), design.steady.Y.shape[1] - a.shape[1])

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.control.design import Design, read_bounds, read_moves, read_prices, read_weight
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import LinearScheme, free_mpc, lowered, target_mpc
+from torch_qpmpc.control.lowering import Affine, LinearScheme, free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError
@@ -35,7 +35,7 @@ class Target(NamedTuple):
     y: Tensor
 
 
-class LinearMPC(QPMPC):
+class LinearMPC(Affine):
     """A linear MPC with set-points, prices of moves and disturbances: a `QPMPC`.
 
     The plan's cost is the sum over the stages of
@@ -74,7 +74,7 @@ class LinearMPC(QPMPC):
             default a tied structure that learns nothing, and DAQP.
 
     Attributes:
-        targets: the QPMPC whose policy maps [r; w; d] to the target; see
+        targets: the QPMPC whose policy maps [r; w; d; 1] to the target; see
             `torch_qpmpc.control.lowering`.
         free: the one of the inputs that the target leaves free, None if there are none.
 
@@ -174,11 +174,6 @@ class LinearMPC(QPMPC):
         design = replace(self.design, **read_wishes(self.design.plant, **changes))
         return LinearMPC(lowered(design), **{name: self.arguments[name] for name in KEYWORDS})
 
-    @property
-    def constants(self) -> dict[int, float]:
-        """The last entry of p, which is one."""
-        return {self.n_p - 1: 1.0}
-
     def extra_repr(self) -> str:
         return f"{self.design}, {super().extra_repr()}"
 
@@ -248,14 +243,14 @@ class LinearMPC(QPMPC):
         return self.steady_state(v, s)
 
     def steady_state(self, v: Tensor, s: Tensor) -> Target:
-        """Return the steady state of ``v`` and ``s = [r; w; d]``, by the maps of ``steady``."""
+        """Return the steady state of ``v`` and ``s = [r; w; d; 1]``, by the maps of ``steady``."""
         steady = self.design.steady
-        loads = torch.cat((s[..., len(steady.y) :], s.new_ones(*s.shape[:-1], 1)), -1)
+        loads = s[..., len(steady.y) :]
         pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
         return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in pairs))
 
     def _target_inputs(self, r: Any, w: Any, known: Any) -> Tensor:
-        """Return [r; w; d] ``(*batch, n_y + n_w + n_d)``."""
+        """Return [r; w; d; 1] ``(*batch, n_y + n_w + n_d + 1)``."""
         sizes = {"r": len(self.design.Q), "w": len(self.design.disturbances.names)}
         sizes["known"] = self.design.plant.sizes[3]
         parts = {"r": r, "w": w, "known": known}
@@ -265,7 +260,8 @@ class LinearMPC(QPMPC):
                 got, want = f"shape {tuple(part.shape)}", f"(*batch, {sizes[name]})"
                 raise QPError.expected(name, got, want)
         batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
-        return torch.cat([part.expand(*batch, sizes[name]) for name, part in parts.items()], -1)
+        parts = [part.expand(*batch, sizes[name]) for name, part in parts.items()]
+        return torch.cat((*parts, parts[0].new_ones(*batch, 1)), -1)
 
     def arrange(self, x: Any, target: Target, **signals: Any) -> Tensor:
         """Return p ``(*batch, n_p)`` in float64.

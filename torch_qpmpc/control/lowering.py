@@ -6,10 +6,10 @@ The target is the steady state within bounds that is nearest to the set-point:
 
 where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known signals d (see
 `torch_qpmpc.control.disturbance`). It is the policy of a one-stage `QPMPC` whose state, and p, is
-[r; w; d] and whose action is v.
+[r; w; d; 1] and whose action is v.
 
 Where several steady states have the same outputs with a weight, v = [a; f], the action is a,
-bounded so that an f exists. The policy of a second QPMPC with the state [a; w; d] is f: least
+bounded so that an f exists. The policy of a second QPMPC with the state [a; w; d; 1] is f: least
 inputs within their bounds. One QP for both would need a weight of f so small that numbers in C lose
 their digits; it remains where f moves an output with soft bounds.
 """
@@ -38,8 +38,8 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.riccati import lqr_gain, riccati_weight
 from torch_qpmpc.mpc.scheme import Scheme
 
-#: The value at the target, relative to a typical deviation's in each stage: errors are certified
-#: relative to the value, which must not be zero.
+#: The value at the target, relative to a typical deviation's in each stage, which p's last entry,
+#: one, adds: errors are certified relative to the cost, which must not be zero.
 SCALE = 1e-2
 #: An eigenvalue this near to the unit circle is on it.
 ON_CIRCLE = 1e-6
@@ -65,6 +65,15 @@ class LinearScheme(Scheme):
         if self.bounds.constraints is None:
             return super().of_actions
         return self.bounds.constraints[0][:, -self.layout.n_u :].any(-1)
+
+
+class Affine(QPMPC):
+    """A QPMPC whose p ends with a one."""
+
+    @property
+    def constants(self) -> dict[int, float]:
+        """The last entry of p, which is one."""
+        return {self.n_p - 1: 1.0}
 
 
 def lowered(design: Design) -> LinearScheme:
@@ -186,28 +195,27 @@ def is_split(design: Design) -> bool:
 
 
 def target_mpc(design: Design) -> QPMPC:
-    """Return the QPMPC whose policy maps [r; w; d] to v, or to a if f has a QP of its own."""
+    """Return the QPMPC whose policy maps [r; w; d; 1] to v, or to a if f has a QP of its own."""
     steady, n_y, split = design.steady, len(design.Q), is_split(design)
     n_v = steady.n_a if split else steady.Y.shape[1]
-    n_x = n_y + steady.y.shape[1] - 1
-    # y_s - r and u_s as maps of [r; w; d; v], and constants.
-    error = np.hstack((-np.eye(n_y), steady.y[:, :-1], steady.Y))
-    inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u[:, :-1], steady.U))
+    n_x = n_y + steady.y.shape[1]
+    # y_s - r and u_s as maps of [r; w; d; 1; v].
+    error = np.hstack((-np.eye(n_y), steady.y, steady.Y))
+    inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u, steady.U))
     weight = 2 * error.T @ design.Q @ error
-    linear = 2 * error.T @ design.Q @ steady.y[:, -1]
     if len(steady.W) and not split:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
-    lower, upper = (side - steady.u[:, -1] for side in design.u_bounds)
+    lower, upper = design.u_bounds
     rows = (np.isfinite(lower) | np.isfinite(upper)) & inputs[:, n_x:].any(-1)
     y, u, _, d = design.scaling
-    D, of_s = inputs[rows] / u[rows, None], np.concatenate((y, design.of_w(y), d))
+    D, of_s = inputs[rows] / u[rows, None], np.concatenate((y, design.of_w(y), d, [1.0]))
     D[:, :n_x] *= of_s
     rows = D, lower[rows] / u[rows], upper[rows] / u[rows]
     if split:
         rows = _without_last(*rows, len(steady.W))
     D, lower, upper = rows
     D[:, :n_x] /= of_s
-    lower_y, upper_y = (side - steady.y[:, -1] for side in design.y_bounds)
+    lower_y, upper_y = design.y_bounds
     error[:, :n_y] = 0.0
     soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
     price = np.full(len(D), np.inf)
@@ -217,39 +225,36 @@ def target_mpc(design: Design) -> QPMPC:
     slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[soft])
     D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
     lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
-    weight, linear = weight[: n_x + n_v, : n_x + n_v], linear[: n_x + n_v]
-    return _of_one_stage(n_x, weight, linear, SCALE * design.typical, (D, lower, upper), slack)
+    weight = weight[: n_x + n_v, : n_x + n_v]
+    return _of_one_stage(n_x, weight, SCALE * design.typical, (D, lower, upper), slack)
 
 
 def free_mpc(design: Design) -> QPMPC | None:
-    """Return the QPMPC whose policy maps [a; w; d] to f, None if f has no QP of its own."""
+    """Return the QPMPC whose policy maps [a; w; d; 1] to f, None if f has no QP of its own."""
     if not is_split(design):
         return None
-    steady, n_a, n_f = design.steady, design.steady.n_a, len(design.steady.W)
-    n_x = n_a + steady.u.shape[1] - 1
+    steady, n_a = design.steady, design.steady.n_a
+    n_x = n_a + steady.u.shape[1]
     bounded = design.bounded[1]
-    D = np.hstack((steady.U[:, :n_a], steady.u[:, :-1], steady.U[:, n_a:]))
-    D, *sides = (
-        ((part.T / design.scaling.u).T)[bounded]
-        for part in (D, *(side - steady.u[:, -1] for side in design.u_bounds))
-    )
+    D = np.hstack((steady.U[:, :n_a], steady.u, steady.U[:, n_a:]))
+    D, *sides = (((part.T / design.scaling.u).T)[bounded] for part in (D, *design.u_bounds))
     size = float(np.linalg.norm(steady.W, 2))
     slack = np.full(len(D), NEARLY_HARD * size)
     weight = block_diag(np.zeros((n_x, n_x)), 2 * steady.W)
-    return _of_one_stage(n_x, weight, np.zeros(n_x + n_f), SCALE * size, (D, *sides), slack)
+    return _of_one_stage(n_x, weight, SCALE * size, (D, *sides), slack)
 
 
 def _of_one_stage(
-    n_x: int, weight: Any, linear: Array, constant: float, rows: tuple[Array, ...], slack: Array
-) -> QPMPC:
+    n_x: int, weight: Any, constant: float, rows: tuple[Array, ...], slack: Array
+) -> Affine:
     """Return the QPMPC with the rows (D, lower, upper), whose state has no cost at its end."""
     n_v = len(weight) - n_x
-    terminal = np.zeros((n_x, n_x))
-    cost = Cost(weight, terminal, hessian="block", q=np.pad(linear, (0, n_x)), c=constant)
+    weight[n_x - 1, n_x - 1] += 2 * constant
+    cost = Cost(weight, np.zeros((n_x, n_x)), hessian="block")
     model = Model(np.eye(n_x), np.zeros((n_x, n_v)))
     bounds = Bounds(constraints=rows, constraint_slack=slack) if len(rows[0]) else Bounds()
     scheme = Scheme(Layout(n_x, n_v, horizon=1), model, cost, bounds, gamma=1.0)
-    return QPMPC(scheme, learn=(), solver="daqp")
+    return Affine(scheme, learn=(), solver="daqp")
 
 
 def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array, Array]:

@@ -104,12 +104,12 @@ static int aim(policy_state *s, const real r[], const real level[])
     copy(loads + N_W, level, N_D);
     loads[LOADS - 1] = 1;
     copy(t, r, N_Y);
-    copy(t + N_Y, loads, N_W + N_D);
+    copy(t + N_Y, loads, LOADS);
     code = policy_target_step(&s->target, t, v, 0);
 #if POLICY_N_F
     if (code == POLICY_SOLVED) {
         copy(t, v, N_A);
-        copy(t + N_A, loads, N_W + N_D);
+        copy(t + N_A, loads, LOADS);
         code = policy_free_step(&s->free, t, v + N_A, 0);
     }
 #endif

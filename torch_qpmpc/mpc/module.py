@@ -45,7 +45,7 @@ from torch_qpmpc.mpc.validation import (
     without_gradients,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
-from torch_qpmpc.qp.pipeline.solve import ON_FAILURE
+from torch_qpmpc.qp.pipeline.solve import ON_FAILURE, AtRest
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
@@ -360,15 +360,22 @@ class QPMPC(nn.Module):
         if isinstance(observation, Tensor):
             observation = observation.detach().cpu()
         try:
-            s = torch.as_tensor(np.asarray(observation))
+            x = np.asarray(observation)
+            x = x if x.dtype.kind == "f" else torch.as_tensor(x).double().numpy()
         except (TypeError, ValueError) as error:
             got, want = type(observation).__name__, f"an array of shape (.., {self.n_p})"
             remedy = "Pass the observation alone; env.reset and env.step return more."
             raise QPError.expected("observation", got, want, remedy) from error
-        if not s.isfinite().all():
+        if x.shape[-1:] != (self.n_p,):
+            check_tensor("observation", torch.as_tensor(x), self.n_p)
+        if not np.isfinite(x).all():
             raise QPError.expected("observation", "NaN or inf", "finite numbers")
-        s = (s if s.is_floating_point() else s.double()).to(self.C_0.device)
-        s = check_tensor("observation", s, self.n_p)
+        if x.size == self.n_p and (at_rest := self._solver_at_rest()) is not None:
+            solution = at_rest.solve(x.reshape(1, -1).astype(np.float64))
+            if not solution.status[0]:  # else the other way raises its error
+                u = solution.z[0, self.n_p : self.n_p + self.n_u]
+                return u.reshape(*x.shape[:-1], self.n_u).astype(x.dtype)
+        s = torch.as_tensor(x).to(self.C_0.device)
         return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
 
     def forward(
@@ -705,6 +712,22 @@ class QPMPC(nn.Module):
         if self.schedule is not None:
             qp = self._scheduled(qp, fixed[..., : self.n_p])
         return solve(qp, fixed, n_kept, self.solver, on_failure or self.on_failure, warm_start)
+
+    @torch.no_grad()
+    def at_rest(self) -> AtRest:
+        """Return what solves V's QPs with today's theta, without the schedule, one by one."""
+        return AtRest(self.quadratic_program(), self.n_p, self.n_p + self.n_u, self.solver)
+
+    def _solver_at_rest(self) -> AtRest | None:
+        """Return `at_rest` until theta changes; None if that cannot be seen."""
+        if self._random or self.schedule is not None:
+            return None
+        leaves, solver = vars(self).get("_at_rest", (None, None))
+        if leaves is None or not leaves.unchanged(self) or solver.solver != self.solver:
+            leaves = parameters.Leaves(self)
+            solver = self.at_rest()
+            vars(self)["_at_rest"] = leaves, solver
+        return solver if leaves.known else None
 
     def _scheduled(self, qp: QuadraticProgram, s: Tensor) -> QuadraticProgram:
         """Return ``qp`` with the schedule's changes of C and b at s."""

@@ -9,9 +9,12 @@ coordinates themselves.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import starmap
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
@@ -21,7 +24,11 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Masked, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 from torch_qpmpc.qp.batching import broadcast, to_dtype
+from torch_qpmpc.qp.kernels.linalg import equal
+from torch_qpmpc.qp.tracing import PLAIN
 
+#: Parts with more entries are large.
+LARGE = 2**14
 #: The coordinates of a tied C and a tied G.
 MODELS: dict[type, tuple[str, ...]] = {Banded: ("A", "B", "E"), LinearRows: ("D", "D_f")}
 
@@ -164,6 +171,54 @@ def check_names(argument: str, names: Collection[str], module: nn.Module) -> Non
         remedy = f"Add {unlearned[0]} to learn." if unlearned else ""
         expected = f"names among {', '.join(known)}"
         raise QPError.expected(argument, ", ".join(map(repr, unknown)), expected, remedy)
+
+
+class Leaves:
+    """The modules and tensors that a QPMPC's theta follows from, and their content.
+
+    Contents are compared, as versions do not show changes by ``.data``, NumPy or other processes;
+    those of large parts that are not learned, which would take the longest, are not.
+
+    Attributes:
+        known: True if all tensors are plain and none is a plain attribute, as in functional calls.
+    """
+
+    def __init__(self, module: Any) -> None:
+        self._walked = _walked(module)
+        tensors = [x for x in self._walked if isinstance(x, Tensor)]
+        attributes = (vars(x).values() for x in self._walked if isinstance(x, nn.Module))
+        plain = all(
+            type(x) in PLAIN and x.device.type == "cpu" and x.is_contiguous() for x in tensors
+        )
+        self.known = plain and not any(isinstance(x, Tensor) for part in attributes for x in part)
+        rest = [x for name, x in module._buffers.items() if name not in module.learned]
+        large = {id(x) for x in rest if x.numel() > LARGE}
+        self._states, self._contents = [(x, x.data_ptr(), x._version) for x in tensors], []
+        for x in tensors if self.known else ():
+            if id(x) not in large:
+                own = x.detach().reshape(-1).numpy().view(np.uint8)
+                self._contents.append((own, own.copy()))
+
+    def unchanged(self, module: nn.Module) -> bool:
+        """Return True if ``module`` has the same modules, tensors and content."""
+        walked = _walked(module)
+        return (
+            self.known
+            and len(walked) == len(self._walked)
+            and all(map(operator.is_, walked, self._walked))
+            and all(x.data_ptr() == at and x._version == n for x, at, n in self._states)
+            and all(starmap(equal, self._contents))
+        )
+
+
+def _walked(module: nn.Module) -> list[Any]:
+    """Return a module, its tensors but C_0, which theta does not depend on, and its children's."""
+    found: list[Any] = [module, *module._parameters.values()]
+    found += [x for name, x in module._buffers.items() if name != "C_0"]
+    for child in module._modules.values():
+        if child is not None:
+            found += _walked(child)
+    return found
 
 
 def for_each(

@@ -28,7 +28,7 @@ from collections.abc import Callable
 from types import ModuleType
 
 import numpy as np
-import scipy.sparse
+import scipy
 import torch
 from torch import Tensor
 

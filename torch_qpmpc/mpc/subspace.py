@@ -18,8 +18,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.special
+import scipy  # imports its parts at their first use: a fifth of a second
 import torch
 
 from torch_qpmpc.mpc.innovations import Array, Innovations

@@ -170,8 +170,7 @@ class QuadraticProgram:
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
     def _check_shapes(self) -> None:
-        if not self._fits():
-            self._raise_mismatch()
+        self._check_events()
         try:
             _ = self.batch_shape
         except RuntimeError as error:
@@ -180,21 +179,7 @@ class QuadraticProgram:
                 "batch", f"shapes {shapes}", "leading dimensions that broadcast"
             ) from error
 
-    def _fits(self) -> bool:
-        """True if dtypes, devices and event shapes match: a fast test of the common case."""
-        tensors = self.tensors()
-        if not all(isinstance(x, Tensor) for x in tensors):
-            return False
-        if len({(x.dtype, x.device) for x in tensors}) > 1 or self.H.dtype not in DTYPES:
-            return False
-        n_z, n_c, n_g = (x.shape[-1] if x.ndim else 0 for x in (self.q, self.b, self.lb))
-        events = (n_z, n_z), (n_z,), (), (n_c, n_z), (n_c,), (n_g, n_z), (n_g,), (n_g,), (n_g,)
-        return all(
-            x.ndim >= n and x.shape[x.ndim - n :] == event
-            for x, n, event in zip(tensors, NDIMS, events, strict=True)
-        )
-
-    def _raise_mismatch(self) -> None:
+    def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):
             if not isinstance(x, Tensor) or not x.is_floating_point():
                 got = x.dtype if isinstance(x, Tensor) else type(x).__name__

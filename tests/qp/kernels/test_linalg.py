@@ -14,6 +14,8 @@ from torch_qpmpc.qp.kernels.linalg import products, transposed_products
 from torch_qpmpc.qp.pipeline.condensing import DEFINITE, SHIFT
 
 RNG = np.random.default_rng(0)
+#: The spans of more than one matrix.
+NONE = np.zeros((0, 2), np.int64)
 
 
 def matrix_with(eigenvalues: list[float]) -> np.ndarray:
@@ -66,24 +68,51 @@ def test_products_are_those_of_each_matrix(M, i, j):
     matrices, group = normal(M, i, j).numpy(), np.arange(6) % M
     left, right = normal(6, i, seed=1).numpy(), normal(6, j, seed=2).numpy()
     expected = np.einsum("bij,bj->bi", matrices[group], right)
-    np.testing.assert_allclose(products(matrices, group, right, False), expected, atol=1e-12)
+    np.testing.assert_allclose(products(matrices, group, right, NONE), expected, atol=1e-12)
     expected = np.einsum("bij,bi->bj", matrices[group], left)
-    found = transposed_products(matrices, group, left, False)
+    found = transposed_products(matrices, group, left, NONE)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_more_than_one_thread_would_take_is_multiplied_in_parts():
     matrix, vectors = normal(1, 300, 400).numpy(), normal(5, 400, seed=1).numpy()
     assert matrix.size > linalg.ONE_THREAD // 5
-    found = products(matrix, np.zeros(5, np.int64), vectors, False)
+    found = products(matrix, np.zeros(5, np.int64), vectors, NONE)
     np.testing.assert_allclose(found, vectors @ matrix[0].T, atol=1e-11)
 
 
 def test_a_diagonal_matrix_is_multiplied_as_such():
     matrix, vectors = np.diag(np.arange(4.0))[None], normal(3, 4).numpy()
     for product in (products, transposed_products):
-        found = product(matrix, np.zeros(3, np.int64), vectors, True)
+        found = product(matrix, np.zeros(3, np.int64), vectors, linalg.row_spans(matrix))
         np.testing.assert_array_equal(found, vectors * np.arange(4.0))
+
+
+def test_spans_hold_all_nonzero_entries_of_a_single_matrix():
+    matrix = np.zeros((1, 4, 6))
+    matrix[0, 0, 2], matrix[0, 1, [0, 5]], matrix[0, 3, 3:5] = 1e-300, -1.0, np.nan
+    expected = [[2, 3], [0, 6], [0, 0], [3, 5]]
+    np.testing.assert_array_equal(linalg.row_spans(matrix), expected)
+    assert linalg.row_spans(matrix.repeat(2, 0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (0, 3), (3, 0)])
+def test_one_vector_is_multiplied_within_the_spans(i, j):
+    matrix = normal(1, i, j).numpy() * (RNG.random((1, i, j)) < 0.4)
+    left, right, spans = normal(1, i).numpy(), normal(1, j).numpy(), linalg.row_spans(matrix)
+    found = products(matrix, np.zeros(1, np.int64), right, spans)
+    np.testing.assert_allclose(found, right @ matrix[0].T, atol=1e-14)
+    found = transposed_products(matrix, np.zeros(1, np.int64), left, spans)
+    np.testing.assert_allclose(found, left @ matrix[0], atol=1e-14)
+
+
+def test_arrays_are_equal_byte_by_byte():
+    one = np.arange(1000, dtype=np.uint8)
+    for at in (0, 517, 999):
+        other = one.copy()
+        assert linalg.equal(one, other)
+        other[at] ^= 128
+        assert not linalg.equal(one, other)
 
 
 # For each theta

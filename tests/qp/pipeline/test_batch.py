@@ -92,20 +92,6 @@ def test_invalid_data_is_found_in_every_tensor(batch, matrices):
         assert valid.tolist() == [True, False, True, True]
 
 
-def test_a_diagonal_is_one_of_a_single_square_matrix():
-    known = known_qp(0)
-    H = torch.diag(torch.arange(12.0).double())
-    theta = known.qp.tensors()[1:]
-    assert Programs.of(H, *theta, known.fixed)[0].prepared.diagonal == (
-        True,
-        False,
-    )  # G has 13 rows
-    H[3, 5] = H[5, 3] = 1e-300
-    assert Programs.of(H, *theta, known.fixed)[0].prepared.diagonal == (False, False)
-    many = torch.arange(1.0, 4.0).double()[:, None, None] * torch.eye(12).double()
-    assert Programs.of(many, *theta, known.fixed)[0].prepared.diagonal == (False, False)
-
-
 def test_theta_in_float32_is_solved_in_float64():
     known = known_qp(0, dtype=torch.float32)
     theta = Programs.of(*known.qp.tensors(), known.fixed)[0].theta

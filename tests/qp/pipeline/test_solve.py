@@ -9,12 +9,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.problems import KnownQP, known_qp
+from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
-from torch_qpmpc.qp.pipeline.arrays import SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.solve import AtRest
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
@@ -185,16 +186,85 @@ def test_only_rejected_solutions_are_solved_again(monkeypatch, asked):
 
 
 def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked):
-    def misled(p: Programs, qps: SoftQPs, active: np.ndarray) -> tuple:
-        return LIES["v off"](daqp.solve(qps)), np.ones(len(active), dtype=np.bool_)
+    def misled(p: Programs, active: np.ndarray) -> BatchSolution:
+        return p.recover(LIES["v off"](daqp.solve(p.reduced_qps())))
 
-    monkeypatch.setattr(Programs, "try_active_sets", misled)
+    monkeypatch.setattr(Programs, "recalled", misled)
     known = known_qp(2, batch=(BATCH,))
     active = solve(known, solver="daqp").active
     with SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=active), known)
     assert counts(asked) == [BATCH]
     assert (log.fallback, log.recalled) == (0, 0)
+
+
+def one_by_one(known: KnownQP, rest: AtRest) -> list[BatchSolution]:
+    return [rest.solve(s[None]) for s in known.fixed.numpy()]
+
+
+def at_rest(known: KnownQP, solver: str = "daqp", **changes) -> AtRest:
+    n_f = known.fixed.shape[-1]
+    return AtRest(replace(known.qp, **changes), n_f, n_f, solver)
+
+
+def shared(seed: int, **options) -> KnownQP:
+    """Return known QPs that differ in their fixed entries alone, though not in their solution's."""
+    one = known_qp(seed, batch=(), **options)
+    steps = torch.linspace(-0.6, 0.6, 20, dtype=torch.float64)[:, None]
+    return replace(one, fixed=one.fixed + steps * normal(one.fixed.shape[-1], seed=seed))
+
+
+@pytest.mark.parametrize("units", [1.0, 2.0**20])
+@pytest.mark.parametrize("seed", range(8))
+def test_qps_at_rest_have_the_solutions_of_a_batch(seed, units):
+    """From its own active set, a batch's solution is exact."""
+    known = shared(seed)
+    qp = replace(known.qp, **{x: units * getattr(known.qp, x) for x in ("H", "q", "w")})
+    known = replace(known, qp=qp)
+    batch = solve(known, solver="daqp", on_failure="mask")
+    batch = solve(known, solver="daqp", on_failure="mask", warm_start=batch)
+    with SolveLog() as log:
+        rest = at_rest(known)
+        answers = one_by_one(known, rest)
+    assert (rest.prepared.units is None) == (units == 1)
+    assert batch.solved.any()
+    assert batch.active[batch.solved].any()
+    for k, answer in enumerate(answers):
+        assert answer.status[0] == batch.status[k]
+        if not answer.status[0]:
+            for name in ("value", "z", "lam", "chi", "xi"):
+                one, other = getattr(answer, name)[0], getattr(batch, name)[k].numpy()
+                assert np.abs(one - other).max() <= 1e-9 * (1 + np.abs(other).max())
+    assert (log.solves, log.unsolved) == (20, int((~batch.solved).sum()))
+    assert log.recalled > 0
+
+
+def test_what_the_last_set_does_not_solve_gets_to_the_solver(monkeypatch, asked):
+    known = shared(1)
+    right = solve(known, solver="daqp")
+    monkeypatch.setattr(Programs, "recalled", lambda p, active: p.unsolved(0))
+    rest = at_rest(known, "recorder")
+    for answer, value in zip(one_by_one(known, rest), right.value, strict=True):
+        assert_close(answer.value[0], value.item())
+    assert counts(asked) == [1] * 20
+
+
+def test_a_cost_that_is_not_convex_has_no_solution_at_rest():
+    known = shared(2)
+    rest = at_rest(known, H=-known.qp.H, check_values=False)
+    assert {x.status[0] for x in one_by_one(known, rest)} == {Status.INVALID_DATA}
+    nan = np.full((1, known.fixed.shape[-1]), np.nan)
+    assert at_rest(known).solve(nan).status[0] == Status.INVALID_DATA
+
+
+def test_threads_share_a_theta_at_rest():
+    known = shared(3)
+    rest, expected = at_rest(known), one_by_one(known, at_rest(known))
+    with ThreadPoolExecutor(4) as pool:
+        results = [*pool.map(lambda _: one_by_one(known, rest), range(8))]
+    for answers in results:
+        for one, other in zip(answers, expected, strict=True):
+            assert_close(one.z, other.z, rtol=1e-9, atol=1e-9)
 
 
 def test_a_solver_does_not_get_its_failures_again(monkeypatch, asked):

@@ -57,6 +57,15 @@ larger: Any = intrinsic(_larger)
 
 
 @compiled
+def equal(x, y):
+    """Return True if all bytes of two arrays are equal."""
+    difference = np.uint8(0)
+    for j in range(len(y)):
+        difference |= x[j] ^ y[j]
+    return difference == 0
+
+
+@compiled
 def copy(x, y):
     """x = y, as a loop: Numba's assignment to a slice takes seconds to compile."""
     for j in range(len(x)):
@@ -99,14 +108,17 @@ def dot(x, y):
 
 
 @compiled
-def products(matrices, group, vectors, diagonal):
+def products(matrices, group, vectors, spans):
     """Multiply each QP's matrix by its vector: ``(M, i, j)`` and ``(B, j)`` to ``(B, i)``.
 
-    With ``diagonal``, all QPs share one diagonal matrix.
+    ``spans`` are the `row_spans` of the only matrix, or empty.
     """
     out = np.empty((len(vectors), matrices.shape[1]))
-    if diagonal:
-        _scale(matrices[0], vectors, out)
+    if _pays(spans, vectors):
+        for i in range(len(vectors)):
+            for j in range(len(spans)):
+                first, end = spans[j]
+                out[i, j] = dot(matrices[0, j, first:end], vectors[i, first:end])
     elif len(matrices) == 1 and matrices.size:
         chunk = max(1, ONE_THREAD // matrices.size)
         for i in range(0, len(vectors), chunk):
@@ -119,11 +131,14 @@ def products(matrices, group, vectors, diagonal):
 
 
 @compiled
-def transposed_products(matrices, group, vectors, diagonal):
+def transposed_products(matrices, group, vectors, spans):
     """Do as `products` with transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
     out = np.zeros((len(vectors), matrices.shape[2]))
-    if diagonal:
-        _scale(matrices[0], vectors, out)
+    if _pays(spans, vectors):
+        for i in range(len(vectors)):
+            for j in range(len(spans)):
+                first, end = spans[j]
+                add(out[i, first:end], vectors[i, j], matrices[0, j, first:end])
     elif len(matrices) == 1 and matrices.size:
         chunk = max(1, ONE_THREAD // matrices.size)
         for i in range(0, len(vectors), chunk):
@@ -135,10 +150,27 @@ def transposed_products(matrices, group, vectors, diagonal):
 
 
 @compiled
-def _scale(matrix, vectors, out):
-    for i in range(len(vectors)):
-        for j in range(len(matrix)):
-            out[i, j] = vectors[i, j] * matrix[j, j]
+def row_spans(matrices):
+    """Return the first and the end of the nonzero entries in each row, ``(i, 2)``.
+
+    Of more than one matrix they are empty, ``(0, 2)``.
+    """
+    spans = np.zeros((matrices.shape[1] if len(matrices) == 1 else 0, 2), np.int64)
+    for i in range(len(spans)):
+        for j in range(matrices.shape[2]):
+            if matrices[0, i, j] != 0:
+                spans[i, 0] = j if spans[i, 1] == 0 else spans[i, 0]
+                spans[i, 1] = j + 1
+    return spans
+
+
+@compiled
+def _pays(spans, vectors):
+    """Return True if loops over spans are faster than BLAS: of one vector, or short ones."""
+    widest = 0
+    for j in range(len(spans)):
+        widest = max(widest, spans[j, 1] - spans[j, 0])
+    return len(spans) > 0 and (len(vectors) == 1 or widest <= 1)
 
 
 @compiled

@@ -106,7 +106,7 @@ def offsets(fixed, group, matrix, constant):
 
 
 @compiled
-def recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
+def recover(v, lam_v, group, fixed, theta, reduced, sizes, passes):
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
@@ -115,7 +115,6 @@ def recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     Args:
         v, lam_v: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
         group, fixed, theta, reduced, sizes: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
-        diagonal: two flags, True if the batch shares one diagonal H, and one diagonal G.
         passes: the number of iterative refinements of z and chi after the elimination.
 
     Returns:
@@ -124,30 +123,31 @@ def recover(v, lam_v, group, fixed, theta, reduced, sizes, diagonal, passes):
     """
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
+    of_H, of_C, of_G, of_T, of_Y = sizes.spans
     kept = np.empty((n_qps, n_f + v.shape[1]))
     for i in range(n_qps):
         copy(kept[i, :n_f], fixed[i])
         copy(kept[i, n_f:], v[i])
-    z = products(reduced.T, group, kept, False)
+    z = products(reduced.T, group, kept, of_T)
     for i in range(n_qps):
         add(z[i], 1.0, reduced.z_0[i % len(reduced.z_0)])
-    Cz = products(C, group, z, False)
+    Cz = products(C, group, z, of_C)
     for _ in range(passes):
         for i in range(n_qps):
             add(Cz[i], -1.0, theta.b[i % len(theta.b)])
-        z += products(reduced.Y_neg, group, Cz, False)
-        Cz = products(C, group, z, False)
-    Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
+        z += products(reduced.Y_neg, group, Cz, of_Y)
+        Cz = products(C, group, z, of_C)
+    Hz, y = products(H, group, z, of_H), products(G, group, z, of_G)
     lam, codes = _all_multipliers(lam_v, y, theta, reduced.rows, reduced.others)
-    G_lam = transposed_products(G, group, lam, diagonal[1])
+    G_lam = transposed_products(G, group, lam, of_G)
     left = Hz + G_lam
     for i in range(n_qps):
         add(left[i], 1.0, q[i % len(q)])
-    chi = transposed_products(reduced.Y_neg, group, left, False)
-    C_chi = transposed_products(C, group, chi, False)
+    chi = transposed_products(reduced.Y_neg, group, left, of_Y)
+    C_chi = transposed_products(C, group, chi, of_C)
     for _ in range(passes):
-        chi += transposed_products(reduced.Y_neg, group, left + C_chi, False)
-        C_chi = transposed_products(C, group, chi, False)
+        chi += transposed_products(reduced.Y_neg, group, left + C_chi, of_Y)
+        C_chi = transposed_products(C, group, chi, of_C)
     left += C_chi
     xi = -left[:, :n_f]
     for i in range(n_qps):
@@ -191,12 +191,13 @@ def _all_multipliers(lam_v, y, theta, rows, others):
 
 
 @compiled
-def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal):
+def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes):
     """Return value, KKT residual and the value's error ``(B,)``."""
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
-    Hz, y = products(H, group, z, diagonal[0]), products(G, group, z, diagonal[1])
-    G_lam = transposed_products(G, group, lam, diagonal[1])
-    C_chi, Cz = transposed_products(C, group, chi, False), products(C, group, z, False)
+    of_H, of_C, of_G, _, _ = sizes.spans
+    Hz, y = products(H, group, z, of_H), products(G, group, z, of_G)
+    G_lam = transposed_products(G, group, lam, of_G)
+    C_chi, Cz = transposed_products(C, group, chi, of_C), products(C, group, z, of_C)
     left = Hz + G_lam + C_chi
     for i in range(len(z)):
         add(left[i, : xi.shape[1]], 1.0, xi[i])
@@ -212,7 +213,7 @@ def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
     H, C, G = theta.H, theta.C, theta.G
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
     n_f = fixed.shape[1]
-    slopes = transposed_products(reduced.T, group, left, False)
+    slopes = transposed_products(reduced.T, group, left, sizes.spans[3])
     value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
     d = reduced.H.shape[1]
     basis, ends, slacks = np.empty((d + 1, d)), np.empty(d + 1), np.empty(d + 1)
@@ -504,31 +505,45 @@ def _excess(y, lam, lb, ub, w):
     return error
 
 
-def try_active_sets(qps, sensitivities, active) -> tuple[Any, ...]:
-    """Try active sets ``(B, r)``.
+@compiled
+def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
+    """Solve QPs from active sets ``(B, n_g)``, corrected where needed; complete and certify them.
 
     Returns:
-        v ``(B, d)``, lam ``(B, r)``, the number of steps, and True where they settled, ``(B,)``.
+        The parts of `BatchSolution`; the residual is infinite where no active set settled.
     """
-    g, lower, upper, w, active = map(np.ascontiguousarray, (qps.g, qps.l, qps.u, qps.w, active))
-    return _try_active_sets(*sensitivities, qps.group, g, lower, upper, w, active)
+    d, r, w = reduced.H.shape[1], len(reduced.rows), reduced.w
+    g_l_u = offsets(fixed, group, reduced.matrix, reduced.constant)
+    g, lower, upper = g_l_u[:, :d].copy(), g_l_u[:, d : d + r].copy(), g_l_u[:, d + r :].copy()
+    codes = np.empty(lower.shape, np.int8)
+    for i in range(len(codes)):
+        for k in range(r):
+            codes[i, k] = active[i, reduced.rows[k]]
+    to_g, to_lam = sensitivities.to_g, sensitivities.to_lam
+    v, lam, steps, done = _try_active_sets(to_g, to_lam, group, g, lower, upper, w, codes)
+    value, z, chi, lam, xi, codes, residual, error = recover(
+        v, lam, group, fixed, theta, reduced, sizes, 0
+    )
+    residual[~done] = np.inf
+    return value, z, chi, lam, xi, 0 * steps, residual, error, steps, codes
 
 
 @compiled
 def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
     n_qps, r = lower.shape
     d = g.shape[1]
-    free = -transposed_products(to_g, group, g, False)  # (v, y) without multipliers
+    nothing = np.empty((0, 2), np.int64)
+    free = -transposed_products(to_g, group, g, nothing)  # (v, y) without multipliers
     lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
     done = np.zeros(n_qps, np.bool_)
     code, held, level = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
-    factor, change, nothing = np.empty((r, r)), np.empty(r), np.zeros(r, np.int8)
+    factor, change = np.empty((r, r)), np.empty(r)
     for i in range(n_qps):
         copy(code, active[i])
         to_lam_i = to_lam[group[i]]
         for j in range(r):
             if not -2 <= code[j] <= 2:
-                copy(code, nothing)
+                code[:] = 0
         while not done[i] and steps[i] < MAX_STEPS:
             steps[i] += 1
             copy(vy[i], free[i])
@@ -536,7 +551,7 @@ def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
             for j in range(r):
                 lam[i, j] = 0.0
                 if abs(code[j]) == 2:
-                    lam[i, j] = math.copysign(w[i, j], code[j])
+                    lam[i, j] = math.copysign(w[i % len(w), j], code[j])
                     add(vy[i], -lam[i, j], to_lam_i[j])
                 elif code[j] != 0:
                     level[j] = upper[i, j] if code[j] > 0 else lower[i, j]
@@ -544,7 +559,7 @@ def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
                     k += 1
             if not _hold_rows(to_lam_i, held[:k], level, SLIP, vy[i], lam[i], factor, change):
                 break
-            done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i])
+            done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i % len(w)])
     return vy[:, :d].copy(), lam, steps, done
 
 

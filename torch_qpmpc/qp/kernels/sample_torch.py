@@ -27,6 +27,7 @@ from torch_qpmpc.qp.kernels.sample import (
     VIOLATED,
     Terms,
 )
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.solution import active_codes
 
 
@@ -50,7 +51,7 @@ def offsets(fixed, group, matrix, constant) -> Tensor:
     return multiply(matrix.mT, group, fixed) + constant
 
 
-def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes) -> tuple[Tensor, ...]:
+def recover(v, lam, group, fixed, theta, reduced, sizes, passes) -> tuple[Tensor, ...]:
     Y_neg, C = reduced.Y_neg, theta.C
     z = multiply(reduced.T, group, torch.cat((fixed, v), dim=-1)) + reduced.z_0
     for _ in range(passes):
@@ -77,7 +78,7 @@ def recover(v, lam, group, fixed, theta, reduced, sizes, diagonal, passes) -> tu
     return value, z, chi, all_lam, xi, codes, *errors
 
 
-def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes, diagonal) -> tuple[Tensor, ...]:
+def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
     Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
     G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
     left = Hz + theta.q + G_lam + C_chi
@@ -222,7 +223,18 @@ def _kinks(y, theta, steps, step) -> Tensor:
     return torch.where((away < move) & theta.w.isfinite(), 2 * theta.w * move, 0).sum(-1)
 
 
-def try_active_sets(qps, sensitivities, active) -> tuple[Tensor, ...]:
+def recall(active, sensitivities, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
+    d, r = reduced.G.shape[:0:-1]
+    g_l_u = offsets(fixed, group, reduced.matrix, reduced.constant)
+    g, lower, upper = g_l_u.split((d, r, r), -1)
+    w = reduced.w.expand(len(group), -1)
+    qps = SoftQPs(reduced.H, reduced.G, group, g, lower, upper, w)
+    v, lam, steps, done = _try_active_sets(qps, sensitivities, active[:, reduced.rows])
+    *solution, codes, residual, error = recover(v, lam, group, fixed, theta, reduced, sizes, 0)
+    return *solution, 0 * steps, residual.where(done, torch.inf), error, steps, codes
+
+
+def _try_active_sets(qps, sensitivities, active) -> tuple[Tensor, ...]:
     known = ((active >= -2) & (active <= 2)).all(-1)
     active = torch.where(known.unsqueeze(-1), active, 0)
     v, lam, y = _solve(qps, sensitivities, active)

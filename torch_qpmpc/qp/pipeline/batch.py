@@ -91,19 +91,10 @@ class Prepared:
         """Theta on the device."""
         return Theta._make(on_device(x, self.device) for x in self.theta)
 
-    @property
+    @cached_property
     def valid(self) -> np.ndarray | None:
         """Mask of finite data, lb <= ub and w >= 0, ``(B or 1,)``; None if all are valid."""
-        return self._inspected[0]
-
-    @property
-    def diagonal(self) -> tuple[bool, bool]:
-        """True if all QPs share one diagonal H, and True if they share one diagonal G."""
-        return self._inspected[1:]
-
-    @cached_property
-    def _inspected(self) -> tuple[np.ndarray | None, bool, bool]:
-        return _inspect(self.theta, self.group)
+        return _valid(self.theta, self.group)
 
     @cached_property
     def units(self) -> Units | None:
@@ -206,22 +197,15 @@ class Prepared:
 
 
 @np.errstate(all="ignore")
-def _inspect(theta: Theta, group: np.ndarray) -> tuple[np.ndarray | None, bool, bool]:
-    """Return `Prepared.valid` and `Prepared.diagonal`."""
+def _valid(theta: Theta, group: np.ndarray) -> np.ndarray | None:
+    """Return `Prepared.valid`."""
     H, C, G, q, c, b, lb, ub, w = theta
     # A sum is finite if its terms are, but for overflow, which no solver survives either.
     finite = np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G)))
     valid = np.isfinite(q.sum(-1) + b.sum(-1) + c) & (finite if len(H) == 1 else finite[group])
     # False for NaN, such as inf - inf of two bounds of the same infinity.
     valid = valid & (ub - lb >= 0).all(-1) & (w >= 0).all(-1)
-    shared = len(H) == 1
-    return None if valid.all() else valid, shared and _is_diagonal(H), shared and _is_diagonal(G)
-
-
-def _is_diagonal(matrices: np.ndarray) -> bool:
-    matrix = matrices[0]
-    square = matrix.shape[0] == matrix.shape[1]
-    return square and np.count_nonzero(matrix) == np.count_nonzero(matrix.diagonal())
+    return None if valid.all() else valid
 
 
 #: The latest thetas that are kept: V and Q of an online and a target network.
@@ -330,8 +314,8 @@ class Programs:
 
     def scaled(self) -> Programs:
         """Return the same QPs in their own units."""
-        assert self.prepared.units is not None
-        return self._in(self.prepared.scaled, self.prepared.units)
+        units = self.prepared.units
+        return self if units is None else self._in(self.prepared.scaled, units)
 
     def equilibrated(self) -> Programs:
         """Return the same QPs in lengths of z that do not depend on bounds."""
@@ -404,19 +388,15 @@ class Programs:
         g, lower, upper = g_l_u[:, :d], g_l_u[:, d : d + r], g_l_u[:, d + r :]
         return SoftQPs(reduced.H, reduced.G, self.group, g, lower, upper, w)
 
-    def try_active_sets(self, qps: SoftQPs, active: Array) -> tuple[BackendSolution, Array]:
-        """Solve the `reduced_qps` from active sets ``(B, n_g)``, corrected where needed.
+    def recalled(self, active: Array) -> BatchSolution:
+        """Solve the QPs from active sets ``(B, n_g)``, corrected where needed, and certify them.
 
         The warm start of every solver, for the whole batch at once. Codes are those of
         `QPSolution.active`; a set with any other code starts as the empty one, and usually settles.
-
-        Returns:
-            The solutions, and True where an active set settled, ``(B,)``.
+        The residual is infinite where a set does not.
         """
-        active = active[:, self.prepared.reduced(self.n_f).rows]
         sensitivities = self.prepared.sensitivities(self.n_f)
-        *solution, settled = self.kernels.try_active_sets(qps, sensitivities, active)
-        return BackendSolution(*solution), settled
+        return BatchSolution(*self.kernels.recall(active, sensitivities, *self._data()))
 
     def hold(self, vy: Tensor, held: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
         """Return v ``(B, d)`` and t ``(B, n_g)`` with ``G v = level`` in the ``held`` rows.
@@ -459,8 +439,7 @@ class Programs:
 
     def _data(self) -> tuple:
         prepared, n_f = self.prepared, self.n_f
-        sizes = prepared.reduced(n_f), prepared.sizes(n_f)
-        return self.group, self.fixed, self.theta, *sizes, prepared.diagonal
+        return self.group, self.fixed, self.theta, prepared.reduced(n_f), prepared.sizes(n_f)
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

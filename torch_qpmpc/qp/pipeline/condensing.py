@@ -136,6 +136,7 @@ class Sizes(NamedTuple):
         bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
         units: the hard rows in v, of unit length, ``(M, h, d)``.
         apart: True if each subset of these rows is well conditioned.
+        spans: the `row_spans` of H, C, G, T and Y_neg.
     """
 
     inverse: Array
@@ -150,6 +151,7 @@ class Sizes(NamedTuple):
     bounds: Array
     units: Array
     apart: bool
+    spans: tuple[Array, ...]
 
 
 class Sensitivities(NamedTuple):
@@ -248,7 +250,9 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     apart = kernels.nearly_orthogonal(units)
     inverse, shift = kernels.inverse_factors(H, DEFINITE, SHIFT)
     stiffness = kernels.row_sums(H).max(-1, initial=0.0)
-    return Sizes(inverse, shift, stiffness, *condensed.sums, steps, hard, box, bounds, units, apart)
+    rows = steps, hard, box, bounds, units, apart
+    spans = tuple(map(kernels.row_spans, (*theta[:3], *condensed.arrays[:2])))
+    return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, spans)
 
 
 def _index_of(rows: np.ndarray) -> np.ndarray:

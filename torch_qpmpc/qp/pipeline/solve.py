@@ -29,11 +29,11 @@ from torch_qpmpc.qp.pipeline.arrays import (
     to_numpy,
     to_tensor,
 )
-from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
-from torch_qpmpc.qp.program import NDIMS, Status
+from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
 from torch_qpmpc.qp.tracing import serial_if_forked
 
@@ -53,6 +53,7 @@ class SolveLog:
         solves: QPs, solved or not.
         unsolved: QPs without a certified solution.
         fallback: QPs whose first solution was rejected.
+        refined: rejected solutions that were refined in twice the working precision, which is slow.
         recalled: QPs solved by their warm start alone.
         iterations: the solvers' iterations.
         residual: largest residual of a certified solution.
@@ -70,6 +71,7 @@ class SolveLog:
     solves: int = 0
     unsolved: int = 0
     fallback: int = 0
+    refined: int = 0
     recalled: int = 0
     iterations: int = 0
     residual: float = 0.0
@@ -181,6 +183,58 @@ def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None
     warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
+class AtRest:
+    """QPs of a theta at rest, solved one after the other, each from the last one's active set.
+
+    What that does not solve, or the certificate rejects, is solved as any other QP.
+
+    Args:
+        qp: one QP.
+        n_f: the number of fixed entries of z.
+        n_kept: see `Programs.of`.
+        solver: a backend's name.
+    """
+
+    def __init__(self, qp: QuadraticProgram, n_f: int, n_kept: int, solver: str) -> None:
+        data = [to_numpy(x.detach()) for x in qp.tensors()]
+        self.prepared, self.solver = prepared_for(data, n_kept, None), solver
+        self._active, programs = (
+            np.zeros((1, qp.lb.shape[-1]), np.int8),
+            self._of(np.zeros((1, n_f))),
+        )
+        # The certificate proves nothing without a convex cost.
+        self._is_sound = programs.scaled().solvable() is None
+
+    def solve(self, fixed: np.ndarray) -> BatchSolution:
+        """Solve and certify the QP with the fixed entries ``(1, n_f)``, in float64."""
+        began, programs, log = time.perf_counter(), self._of(fixed), _active_log.get(None)
+        if (solution := self._recalled(programs)) is None:
+            solution = solve_programs(programs, self.solver)
+            if not solution.status[0]:  # of one set, the solution is the same whatever led to it
+                self._active = solution.active
+                solution = self._recalled(programs) or solution
+        elif log is not None:
+            log.recalled += 1
+            log.add(solution, time.perf_counter() - began)
+        return solution
+
+    def _recalled(self, programs: Programs) -> BatchSolution | None:
+        """Return the certified solution of the last active set, corrected where needed, if any."""
+        if not self._is_sound:
+            return None
+        solution, units = programs.scaled().recalled(self._active), self.prepared.units
+        if units is not None:
+            solution = units.restored(solution, programs.group)
+            _refuted(*_in_own_lengths(programs, solution), programs.group)
+        if max(solution.residual[0], solution.value_error[0]) > TOLERANCE:
+            return None
+        self._active = solution.active
+        return solution
+
+    def _of(self, fixed: np.ndarray) -> Programs:
+        return Programs(self.prepared, np.zeros(1, np.int64), fixed)
+
+
 class Strategy(NamedTuple):
     """One way to solve QPs: from their last active sets, or by a backend."""
 
@@ -198,12 +252,9 @@ class Strategy(NamedTuple):
 
     def certified(self, programs: Programs) -> BatchSolution:
         """Return candidates, completed and certified; active sets that do not settle are none."""
-        qps = programs.reduced_qps()
         if self.start is not None:
-            candidate, settled = programs.try_active_sets(qps, self.start)
-            solution = programs.recover(candidate)
-            solution.residual[~settled] = np.inf
-            return solution
+            return programs.recalled(self.start)
+        qps = programs.reduced_qps()
         solve = self.solve if qps.l.shape[-1] else _unconstrained
         return programs.recover(solve(qps).like(programs.fixed), PASSES if self.eliminate else 0)
 
@@ -232,7 +283,7 @@ def solve_programs(programs: Programs, solver: str, start: Array | None = None) 
     Args:
         programs: the QPs.
         solver: a backend's name, see `torch_qpmpc.qp.solvers`.
-        start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.try_active_sets`.
+        start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`.
     """
     began = time.perf_counter()
     log = _active_log.get(unused := SolveLog())
@@ -242,7 +293,7 @@ def solve_programs(programs: Programs, solver: str, start: Array | None = None) 
     else:
         scaled = programs.scaled()
         solution = units.restored(_solved(scaled, solver, start, log), scaled.group)
-        solution = _confirmed(programs.on_cpu(), solver, solution.on_cpu())
+        solution = _confirmed(programs.on_cpu(), solver, solution.on_cpu(), log)
     if log is not unused:
         log.add(solution, time.perf_counter() - began)
     return solution
@@ -279,6 +330,7 @@ def _solved(programs: Programs, solver: str, start: Array | None, log: SolveLog)
             solution, last = solution and solution.on_cpu(), way is ways[-1]
             todo = None if todo is None else to_numpy(todo)
             rejected = ~answer.accepted() & (last | (answer.residual <= NEARLY))
+            log.refined += int(rejected.sum())
             refine(rest, answer, np.flatnonzero(rejected), last)
         left = indices(~answer.accepted())
         if solution is None or todo is None:
@@ -297,24 +349,34 @@ def _solved(programs: Programs, solver: str, start: Array | None, log: SolveLog)
     return solution
 
 
-def _confirmed(programs: Programs, solver: str, solution: BatchSolution) -> BatchSolution:
-    """Certify scaled solutions in the original numbers, too; solve second those that fail.
+def _in_own_lengths(programs: Programs, solution: BatchSolution) -> tuple[Programs, BatchSolution]:
+    """Return QPs and solutions in the numbers that are certified, with the same errors.
 
-    Of numbers whose columns differ by orders of magnitude, those in lengths of z that follow from
-    the matrices are taken as the original ones: the error of a value has no bound without.
+    They are the original ones; of numbers whose columns differ by orders of magnitude, those in
+    lengths of z that follow from the matrices: the error of a value has no bound without.
+    """
+    if (lengths := programs.prepared.lengths) is None:
+        return programs, solution
+    return programs.equilibrated(), lengths.inverse().restored(solution, programs.group)
+
+
+def _confirmed(
+    programs: Programs, solver: str, solution: BatchSolution, log: SolveLog
+) -> BatchSolution:
+    """Certify scaled solutions in the original numbers, too; solve second those that fail.
 
     The units depend on the bounds. A bound that is far from every solution, such as a large number
     in place of inf, makes them so large that a certificate in these units misses errors.
     """
     units, accepted = programs.prepared.units, np.flatnonzero(solution.accepted())
     assert units is not None
-    if (lengths := programs.prepared.lengths) is not None:
-        scaled, programs = programs.scaled(), programs.equilibrated()
-        solution = lengths.inverse().restored(solution, programs.group)
+    scaled, lengths = programs.scaled(), programs.prepared.lengths
+    programs, solution = _in_own_lengths(programs, solution)
+    if lengths is not None:
         units = units._replace(length=units.length / lengths.length)
-    else:
-        scaled = programs.scaled()
-    failed = refine(programs, solution, _refuted(programs, solution, accepted))
+    rejected = _refuted(programs, solution, accepted)
+    log.refined += len(rejected)
+    failed = refine(programs, solution, rejected)
     if len(failed):
         solution.put(failed, _solved(programs.take(failed), solver, None, SolveLog()))
         in_units = units.inverse().restored(solution, programs.group)

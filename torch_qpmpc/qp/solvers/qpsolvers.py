@@ -15,8 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import qpsolvers
-import scipy.sparse as sp
+import scipy  # imports scipy.sparse at its first use
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
@@ -31,12 +30,12 @@ class SplitSlack:
     over: np.ndarray  # rows that have a t+
     under: np.ndarray  # rows that have a t-
     n_t: int  # slacks
-    H: list[sp.csc_matrix]
-    rows: list[sp.csc_matrix]
+    H: list[scipy.sparse.csc_matrix]
+    rows: list[scipy.sparse.csc_matrix]
 
     @classmethod
     def of(cls, qps: SoftQPs) -> SplitSlack:
-        n_rows, n_v = qps.G.shape[1:]
+        (n_rows, n_v), sp = qps.G.shape[1:], scipy.sparse
         soft = np.isfinite(qps.w).any(axis=0)
         over = np.flatnonzero(soft & np.isfinite(qps.u).any(axis=0))
         under = np.flatnonzero(soft & np.isfinite(qps.l).any(axis=0))
@@ -89,6 +88,8 @@ class SplitSlack:
 
 def check_available(name: str) -> None:
     """Raise `QPError` unless qpsolvers has the solver called ``name`` installed."""
+    import qpsolvers  # imports all its solvers, which takes as long as the rest of this package
+
     if name not in qpsolvers.available_solvers:
         raise QPError.expected(
             "solver",
@@ -100,6 +101,8 @@ def check_available(name: str) -> None:
 
 def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
     """Solve the QPs one by one."""
+    import qpsolvers
+
     qps = qps.in_numpy()
     form = SplitSlack.of(qps)
     v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
@@ -109,7 +112,9 @@ def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
         rows = form.rows[m][: form.n_rows]
         has_upper = np.flatnonzero(np.isfinite(upper[: form.n_rows]))
         has_lower = np.flatnonzero(np.isfinite(lower[: form.n_rows]))
-        one_sided = sp.csc_matrix(sp.vstack([rows[has_upper], -rows[has_lower]]))
+        one_sided = scipy.sparse.csc_matrix(
+            scipy.sparse.vstack([rows[has_upper], -rows[has_lower]])
+        )
         box = np.full(form.n_v, np.inf)
         problem = qpsolvers.Problem(
             form.H[m] if sparse else form.H[m].toarray(),
