@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.optimize
-import scipy.special
+import scipy  # imports its parts at their first use
 import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR
