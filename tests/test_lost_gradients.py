@@ -155,7 +155,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "covariances": (lambda t: tighten(model(), t), [[[0.1, 0.0], [0.0, 0.1]]] * 6),
     "K": (lambda t: tighten(model(), torch.zeros(6, 2, 2).double(), K=t), [[0.1, 0.1]]),
     "W": (lambda t: back_off(model(structure="tied"), t), [[0.1, 0.0], [0.0, 0.1]]),
-    "W ": (lambda t: lqr_gain(*map(torch.tensor, (A, B)), t), np.eye(3)),
+    "W ": (lambda t: lqr_gain(torch.tensor(A), torch.tensor(B), t), np.eye(3)),
     "H": (nearest_psd_by_sdp, [[1.0, 2.0], [2.0, 1.0]]),
     "C ": (lambda t: prediction_form(t, 2, 1), scheme().C_0),
     "at": (lambda t: read(scheme(), at=t), [0.1, 0.2]),

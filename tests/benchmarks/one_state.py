@@ -84,8 +84,9 @@ def clarabel_step(full: FullSpace) -> Step:
     Q, A, G = (sp.csc_matrix(x.detach().numpy()) for x in (full.Q, full.A, full.G))
     p, b, lower, upper = (x.detach().numpy() for x in (full.p, full.b, full.l, full.u))
     above, below = np.isfinite(upper[0]), np.isfinite(lower[0])
-    rows = sp.csc_matrix(sp.vstack((A, G[above], -G[below])))
-    cones = [clarabel.ZeroConeT(A.shape[0]), clarabel.NonnegativeConeT(rows.shape[0] - A.shape[0])]
+    rows: Any = sp.csc_matrix(sp.vstack((A, G[above], -G[below])))
+    n_b = len(b[0])
+    cones = [clarabel.ZeroConeT(n_b), clarabel.NonnegativeConeT(rows.shape[0] - n_b)]
     settings, Q = clarabel.DefaultSettings(), sp.csc_matrix(sp.triu(Q))
     settings.verbose = False
 
