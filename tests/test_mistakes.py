@@ -50,7 +50,7 @@ TD = partial(TensorDict, batch_size=4)
 op, gn = make_operator(), qm.GaussNewton(random_mpc(0))
 deviation, si = qm.DeviationPenalty(mpc.C_0, 2, 1), qm.SystemIdentificationPenalty()
 form = prediction_form(banded_matrix(A2, B1, 4), 2, 1)
-pair = prediction_form(torch.stack([mpc.C] * 2), 2, 1)
+pair = prediction_form(torch.stack([mpc.C_0] * 2), 2, 1)
 model, pm = nearest_model(form), PointMass()
 pendulum, episode = GymnasiumPlant("Pendulum-v1"), PointMassGymEnv()
 episode.reset(seed=0)
@@ -209,16 +209,19 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("windows: got shape (4,) with observation", lambda: windows_to_tau(TD(observation=S))),
     # Analysis
     ("C: got shape (11,), expected shape (*batch, N", lambda: prediction_form(zeros(11), 2, 1)),
-    ("n_x: got 0, expected a whole number >= 1.", lambda: prediction_form(mpc.C, 0, 1)),
-    ("n_u: got -1, expected a whole number >= 1.", lambda: prediction_form(mpc.C, 2, -1)),
+    ("n_x: got 0, expected a whole number >= 1.", lambda: prediction_form(mpc.C_0, 0, 1)),
+    ("n_u: got -1, expected a whole number >= 1.", lambda: prediction_form(mpc.C_0, 2, -1)),
     ("B: got shape (1, 2), expected shape (2, 2) or", lambda: banded_matrix(eye(2), ones(1, 2), 3)),
-    ("C, b: got NaN or inf, expected finite entries.", lambda: prediction_form(mpc.C * nan, 2, 1)),
+    (
+        "C, b: got NaN or inf, expected finite entries.",
+        lambda: prediction_form(mpc.C_0 * nan, 2, 1),
+    ),
     ("form: got Parameter, expected a PredictionForm.", lambda: canonical_matrix(mpc.C, A2)),
     (
         "form.Phi: got shape (2, 6, 2), expected",
         lambda: canonical_matrix(pair, zeros(3, 2, 2).double()),
     ),
-    ("mpc: got Parameter, expected a QPMPC.", lambda: read(mpc.C)),
+    ("mpc: got Tensor, expected a QPMPC.", lambda: read(mpc.C_0)),
     ("true_model: got Tensor, expected the pair (A, B), (A, B, offset) or", lambda: read(mpc, A2)),
     ("true_model: got tuple of 1, expected the pair (A, B), (A, B,", lambda: read(mpc, (A2,))),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: structure_metrics(op)),

@@ -327,7 +327,9 @@ def test_the_host_waits_in_listed_places_only():
         mpc.action_value(s, a).sum().backward()
         mpc.policy(s).sum().backward()
         env = PointMassEnv(num_envs=8, seed=0)
-        batch = env.rollout(6, operator.get_policy_operator("policy_active_set")).reshape(-1)
+        batch = (
+            env.rollout(6, operator.get_policy_operator("policy_active_set")).detach().reshape(-1)
+        )
         loss_module(batch)["loss_value"].backward()
         target = -loss_module.target(batch).reshape(-1)
         qm.GaussNewton(mpc).step(batch["observation"], batch["action"], target)
