@@ -208,6 +208,11 @@ class Steady:
     y: Array
     W: Array
 
+    @property
+    def maps(self) -> tuple[tuple[Array, Array], ...]:
+        """The maps of v and of [w; d; 1] to x_s, to u_s and to y_s."""
+        return (self.X, self.x), (self.U, self.u), (self.Y, self.y)
+
     @classmethod
     def of(
         cls,

@@ -180,8 +180,7 @@ class Law:
 
     def _aimed(self, r: Array, w: Array, level: Array) -> Target | None:
         """Return `LinearMPC.target` of one set-point; None if a QP has no solution."""
-        steady, loads = self.design.steady, np.concatenate((w, level, [1.0]))
-        v, known = np.zeros(0), r
+        loads, v, known = np.concatenate((w, level, [1.0])), np.zeros(0), r
         for aims in self.aims:
             state = np.concatenate((known, loads))
             solution = aims.solve(state[None])
@@ -189,8 +188,8 @@ class Law:
                 return None
             known = solution.z[0, len(state) : -len(state)]
             v = np.concatenate((v, known))
-        pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
-        return Target(*(torch.from_numpy(Z @ v + M @ loads) for Z, M in pairs))
+        maps = self.design.steady.maps
+        return Target(*(torch.from_numpy(Z @ v + M @ loads) for Z, M in maps))
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.

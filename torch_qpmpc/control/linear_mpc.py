@@ -246,8 +246,8 @@ class LinearMPC(Affine):
         """Return the steady state of ``v`` and ``s = [r; w; d; 1]``, by the maps of ``steady``."""
         steady = self.design.steady
         loads = s[..., len(steady.y) :]
-        pairs = ((steady.X, steady.x), (steady.U, steady.u), (steady.Y, steady.y))
-        return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in pairs))
+        maps = steady.maps
+        return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in maps))
 
     def _target_inputs(self, r: Any, w: Any, known: Any) -> Tensor:
         """Return [r; w; d; 1] ``(*batch, n_y + n_w + n_d + 1)``."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -49,9 +49,11 @@ OFFSET = 1e-6
 SETTLES = 100
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
-#: The most powers of ten that the filter's noise is raised by, for a margin, and the most times
-#: that the loop may take as long to settle then as it does now, or as the horizon.
+#: The most powers of ten that the filter is slowed down by, and the most times that the loop may
+#: take as long to settle then as it does now, or as the horizon.
 SLOWEST, PATIENCE = 8, 10
+#: The remedy where no slower filter is one.
+DAMP = "Raise dR tenfold."
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
 
@@ -465,19 +467,13 @@ def _margin(loop: LinearLoop, law: Law, plan: Tables, target: Tables) -> Finding
     }
     if margin >= MARGIN:
         return Finding("margin", True, numbers)
-    remedy = "Raise dR tenfold."
     longest = PATIENCE * max(_settling(loop), law.design.horizon)
-    for power in range(1, SLOWEST + 1):
-        noise = law.noise * 10**power
-        loop = LinearLoop.of(law.mpc, kalman(law.design, noise, law.drift), plan, target)
-        if not _settling(loop) <= longest:
+    for remedy, slower in _slower(law, plan, target, "noise", 10.0):
+        if not _settling(slower) <= longest:
             break
-        if loop.modulus_margin() >= MARGIN:
-            named = dict(zip(law.design.plant.outputs, noise.tolist(), strict=True))
-            pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
-            remedy = f"Slow the filter down, by qm.Controller(.., noise={{{pairs}}})."
-            break
-    return Finding("margin", False, numbers, remedy)
+        if slower.modulus_margin() >= MARGIN:
+            return Finding("margin", False, numbers, remedy)
+    return Finding("margin", False, numbers, DAMP)
 
 
 def _noise(
@@ -489,16 +485,24 @@ def _noise(
     numbers = {"cost of a step": cost, "of a constant input": nothing}
     if cost <= NOISY * nothing:
         return Finding("noise", True, numbers)
-    remedy = "Raise dR tenfold."
-    for power in range(1, SLOWEST + 1):
-        drift = law.drift / 10**power
-        slower = LinearLoop.of(law.mpc, kalman(design, law.noise, drift), plan, target)
+    for remedy, slower in _slower(law, plan, target, "drift", 0.1):
         if slower.cost_of_noise(design, noise) <= NOISY * nothing:
-            named = dict(zip(design.disturbances.names, drift.tolist(), strict=True))
-            pairs = ", ".join(f"{name!r}: {x:.3g}" for name, x in named.items())
-            remedy = f"Slow the filter down, by qm.Controller(.., drift={{{pairs}}})."
-            break
-    return Finding("noise", False, numbers, remedy)
+            return Finding("noise", False, numbers, remedy)
+    return Finding("noise", False, numbers, DAMP)
+
+
+def _slower(
+    law: Law, plan: Tables, target: Tables, option: str, factor: float
+) -> Iterator[tuple[str, LinearLoop]]:
+    """Yield remedies that multiply a filter's deviations by powers of a factor, and their loops."""
+    design, own = law.design, {"noise": law.noise, "drift": law.drift}
+    names = {"noise": design.plant.outputs, "drift": design.disturbances.names}[option]
+    for power in range(1, SLOWEST + 1):
+        slow = own | {option: own[option] * factor**power}
+        pairs = zip(names, slow[option].tolist(), strict=True)
+        text = ", ".join(f"{name!r}: {x:.3g}" for name, x in pairs)
+        remedy = f"Slow the filter down, by qm.Controller(.., {option}={{{text}}})."
+        yield remedy, LinearLoop.of(law.mpc, kalman(design, **slow), plan, target)
 
 
 def _settling(loop: LinearLoop) -> float:

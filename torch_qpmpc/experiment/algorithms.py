@@ -97,8 +97,10 @@ def make_learner(
     else:
         optimizer = make_optimizer(cfg, mpc)
         scheduler = make_scheduler(cfg, optimizer, done)
-        order = second_order if isinstance(optimizer, GaussNewton) else first_order
-        update = order(mpc, loss_module, optimizer, *penalties)  # pyright: ignore[reportArgumentType]
+        if isinstance(optimizer, GaussNewton):
+            update = second_order(mpc, loss_module, optimizer, *penalties)
+        else:
+            update = first_order(mpc, loss_module, optimizer, *penalties)
     return Learner(
         update,
         loss_module,

@@ -148,10 +148,7 @@ class _Course:
 
 
 def _course(model: Innovations) -> tuple[np.ndarray, ...]:
-    P, course = model.P0, []
-    for _ in model.gains(STEPS):
-        gain, V, P = model.gain(P)
-        course.append((gain, _root(V)))
+    course = [(gain, _root(V)) for gain, V in model.settling(STEPS)]
     course.append((model.L, _root(model.S)))
     gains, roots = map(np.array, zip(*course, strict=True))
     return model.A, model.B, model.offset, model.C, model.x0, gains, roots
