@@ -1,12 +1,10 @@
 """The policy's gradient beside the solution and the value's gradient.
 
-    pip install cvxpylayers cvxpygen wheel && pip install --no-build-isolation mpc
     python -m tests.benchmarks.policy --write
 
 CPU time on one thread with DAQP, the median of rounds in which the three take turns; theta moves
 in its last digits before each round. The bounded LQRs are those of Table 1 in
-https://arxiv.org/abs/2505.01353: 128 initial states, N = 20, n_x = 8, n_u = 4. They are solved by
-the packages of `tests.benchmarks.policy_peers` as well, if these are installed.
+https://arxiv.org/abs/2505.01353: 128 initial states, N = 20, n_x = 8, n_u = 4.
 """
 
 from __future__ import annotations
@@ -15,29 +13,26 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tests.benchmarks.policy_peers import AVAILABLE, HORIZON, MODULES, PEERS, Peer, lqr
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.table import significant
 from torch_qpmpc import QPMPC
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
-ROUNDS, WARM_UP = 30, 2
-#: Rounds beside other packages, of which some take seconds.
-FEW = 3
+ROUNDS, WARM_UP, HORIZON = 30, 2, 20
 TITLES = ["batch", "solution", "value's gradient", "policy's gradient", "/ solution", "/ value's"]
 
 
 def bounded_lqr(u_max: float) -> tuple[QPMPC, Tensor]:
-    A, B, offset, states = lqr()
-    n_x, n_u = B.shape
+    n_x, n_u, random = 8, 4, np.random.RandomState(42)
+    A, B = np.eye(n_x) + 0.2 * random.randn(n_x, n_x), random.randn(n_x, n_u)
+    offset, states = random.randn(n_x), random.randn(128, n_x)
     mpc = QPMPC.of(
         n_x,
         n_u,
@@ -74,9 +69,17 @@ def gradient(mpc: QPMPC, function: Callable[[Tensor], Tensor], states: Tensor) -
     function(states).sum().backward()
 
 
-def taken(functions: list[Callable[[], object]], mpc: QPMPC, rounds: int) -> list[float]:
-    """Return the median CPU seconds of functions that take turns, after untimed rounds."""
-    seconds = np.empty((rounds + WARM_UP, len(functions)))
+def measured(mpc: QPMPC, states: Tensor) -> list[float]:
+    """Return the CPU seconds of a solution, a value's and a policy's gradient in theta.
+
+    Each is the median of rounds in which the three take turns, after untimed rounds.
+    """
+    functions: list[Callable[[], object]] = [
+        torch.no_grad()(lambda: mpc.policy(states)),
+        lambda: gradient(mpc, mpc.value, states),
+        lambda: gradient(mpc, mpc.policy, states),
+    ]
+    seconds = np.empty((ROUNDS + WARM_UP, len(functions)))
     for row in seconds:
         for k, run in enumerate(functions):
             nudge(mpc)
@@ -84,33 +87,6 @@ def taken(functions: list[Callable[[], object]], mpc: QPMPC, rounds: int) -> lis
             run()
             row[k] = time.process_time() - began
     return np.median(seconds[WARM_UP:], axis=0).tolist()
-
-
-def measured(mpc: QPMPC, states: Tensor) -> list[float]:
-    """Return the CPU seconds of a solution, a value's and a policy's gradient in theta."""
-    functions: list[Callable[[], object]] = [
-        torch.no_grad()(lambda: mpc.policy(states)),
-        lambda: gradient(mpc, mpc.value, states),
-        lambda: gradient(mpc, mpc.policy, states),
-    ]
-    return taken(functions, mpc, ROUNDS)
-
-
-def beside(u_max: float) -> list[list[str]]:
-    """Return a row for us and each other package: the two times in ms, and the error of u_0."""
-    mpc, states = bounded_lqr(u_max)
-    solved = torch.no_grad()(lambda: mpc.policy(states).numpy())
-    ours = Peer(solved, lambda: gradient(mpc, mpc.policy, states))
-    peers = {"ours": ours} | {name: PEERS[name](u_max) for name in AVAILABLE}
-    functions = [run for peer in peers.values() for run in (peer.solution, peer.gradient)]
-    times = iter(taken(functions, mpc, FEW))
-    truth, rows = solved(), []
-    for name, peer in peers.items():
-        error = np.abs(peer.solution() - truth).max()
-        cells = [significant(1e3 * next(times)) for _ in range(2)]
-        rows.append([name, f"{u_max:g}", *cells, "" if peer is ours else f"{error:.0e}"])
-        print(" | ".join(rows[-1]), flush=True)
-    return rows
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -126,15 +102,9 @@ def main(arguments: list[str] | None = None) -> int:
             [name, str(len(states)), *times, *(f"{policy / x:.2g}" for x in (solution, value))]
         )
         print(" | ".join(rows[-1]), flush=True)
-    others = [row for u_max in (1e4, 1.0) for row in beside(u_max)]
     if options.write:
-        versions = ", ".join(f"{name} {version(MODULES.get(name, name))}" for name in AVAILABLE)
-        parts = [
-            table(["", *TITLES], rows),
-            f"The bounded LQRs by other packages ({versions}), in another round of turns:",
-            table(["", "u_max", "solution", "policy's gradient", "error of u_0"], others),
-        ]
-        text = replaced(PAGE.read_text(encoding="utf-8"), "\n\n".join(parts), "policy")
+        page = PAGE.read_text(encoding="utf-8")
+        text = replaced(page, table(["", *TITLES], rows), "policy")
         PAGE.write_text(text, encoding="utf-8")
     return 0
 
