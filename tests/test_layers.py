@@ -67,7 +67,7 @@ LAYERS = {
 BUDGET = {
     ".": 435,
     "analysis": 1160,
-    "control": 4148,
+    "control": 4287,
     "envs": 1534,
     "experiment": 3927,
     "export": 1427,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,6 +38,8 @@ class Design:
         disturbances: B_w, C_w and names.
         gamma: the discount.
         blocks: numbers of stages that share one input.
+        limits: known signals that bound an output or input from below and above, by its name, ""
+            on a side without one.
 
     Raises:
         QPError: a number is invalid, or nothing has a cost.
@@ -57,6 +59,7 @@ class Design:
     disturbances: Disturbances
     gamma: float
     blocks: tuple[int, ...] = ()
+    limits: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choice("references", self.references, REFERENCES)
@@ -117,8 +120,11 @@ class Design:
 
     @cached_property
     def scaling(self) -> Scaling:
-        """The sizes of the signals."""
-        return Scaling.of(self.plant, self.y_bounds, self.u_bounds, self.Q, self.horizon)
+        """The sizes of the signals; a bound's is that of the signal it bounds."""
+        scaling = Scaling.of(self.plant, self.y_bounds, self.u_bounds, self.Q, self.horizon)
+        for size, of in zip((scaling.y, scaling.u), self.limited, strict=True):
+            scaling.d[of[of >= 0]] = np.broadcast_to(size, of.shape)[of >= 0]
+        return scaling
 
     @cached_property
     def normal(self) -> Design:
@@ -152,8 +158,64 @@ class Design:
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
         """Masks of the outputs and of the inputs with bounds, ``(n_y,)`` and ``(m,)``."""
-        y = np.isfinite(self.y_bounds).any(0) & (self.y_slack > 0)
-        return y, np.asarray(np.isfinite(self.u_bounds).any(0))
+        y, u = (
+            np.isfinite(bounds).any(0) | (of >= 0).any(0)
+            for bounds, of in zip((self.y_bounds, self.u_bounds), self.limited, strict=True)
+        )
+        return y & (self.y_slack > 0), np.asarray(u)
+
+    @cached_property
+    def limited(self) -> tuple[Array, Array]:
+        """Places of the known signals that bound outputs and inputs, ``(2, n)``, -1 without one."""
+        place = {name: i for i, name in enumerate(self.plant.known)}
+        of_y, of_u = (
+            np.array(
+                [[place.get(x, -1) for x in self.limits.get(name, ("", ""))] for name in names]
+            )
+            for names in (self.plant.outputs, self.plant.inputs)
+        )
+        return of_y.T, of_u.T
+
+    @cached_property
+    def nominal(self) -> Array:
+        """What p's known signals are relative to, ``(n_d,)``.
+
+        It is zero, and of bounds such that they leave their signals twice its size.
+        """
+        nominal = np.zeros(len(self.plant.known))
+        bounds = zip(self.limited, self.scaling[:2], (self.y_bounds, self.u_bounds), strict=True)
+        for of, size, (lower, upper) in bounds:
+            ends = (
+                np.where(np.isfinite(upper), upper, size) - 2 * size,
+                np.where(np.isfinite(lower), lower, -size) + 2 * size,
+            )
+            nominal[of[of >= 0]] = np.stack(ends)[of >= 0]
+        return nominal
+
+    def bounds_at(self, known: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Return the bounds of outputs and inputs where the known signals ``(*batch, n_d)`` are."""
+        known = np.insert(known, 0, np.nan, axis=-1)
+        y, u = (
+            np.where(of >= 0, known[..., of + 1], bounds)
+            for of, bounds in zip(self.limited, (self.y_bounds, self.u_bounds), strict=True)
+        )
+        return (y[..., 0, :], y[..., 1, :]), (u[..., 0, :], u[..., 1, :])
+
+    def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
+        """Return rows D with lower and upper bounds, and the place of the signal of each.
+
+        Args:
+            kind: 0 for outputs, 1 for inputs.
+            S, K: the maps to the outputs or inputs and to the known signals.
+        """
+        bounds, of = (self.y_bounds, self.u_bounds)[kind], self.limited[kind]
+        fixed, (side, i) = np.flatnonzero(np.isfinite(bounds).any(0)), np.nonzero(of >= 0)
+        j = of[side, i]
+        lower, upper = (
+            np.append(part[fixed], np.where(side == k, self.nominal[j], limit))
+            for k, (part, limit) in enumerate(zip(bounds, (-np.inf, np.inf), strict=True))
+        )
+        return np.vstack((S[fixed], S[i] - K[j])), lower, upper, np.append(fixed, i)
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -206,10 +268,46 @@ def read_prices(
         if name not in plant.inputs or not (numeric or price in plant.known):
             remedy = f"Pass known={[*plant.known, price]}." * isinstance(price, str)
             raise QPError.expected("linear", f"{{{name!r}: {price!r}}}", want, remedy)
-        if not numeric and plant.E[:, plant.known.index(str(price))].any():
-            got, want = f"{price!r}, which acts on the plant", "a price with a column of zeros in E"
-            raise QPError.expected("linear", got, want, "Pass the signal twice.")
+        if not numeric:
+            _check_apart("linear", str(price), plant)
     return dict(linear or {})
+
+
+def _check_apart(name: str, signal: str, plant: StateSpace) -> None:
+    """Raise `QPError` if a known signal acts on the plant: then p has it less its mean."""
+    if plant.E[:, plant.known.index(signal)].any():
+        got, want = f"{signal!r}, which acts on the plant", "a signal with a column of zeros in E"
+        raise QPError.expected(name, got, want, "Pass the signal twice.")
+
+
+def signals_of(bounds: Any) -> list[str]:
+    """Return the names of known signals in bounds by name or in one pair."""
+    pairs = bounds.values() if isinstance(bounds, Mapping) else [bounds]
+    return [x for pair in pairs if isinstance(pair, Sequence) for x in pair if isinstance(x, str)]
+
+
+def read_limits(
+    name: str, bounds: Any, names: Sequence[str], plant: StateSpace
+) -> tuple[Any, dict[str, tuple[str, str]]]:
+    """Split bounds into numbers and known signals; see `Design.limits`."""
+    if not (signals := signals_of(bounds)):
+        return bounds, {}
+    for signal in signals:
+        if signal not in plant.known:
+            remedy = f"Pass known={[*plant.known, signal]}."
+            raise QPError.expected(name, repr(signal), "numbers or known signals", remedy)
+        _check_apart(name, signal, plant)
+    pairs = bounds if isinstance(bounds, Mapping) else dict.fromkeys(names, tuple(bounds))
+    if any(not isinstance(pair, Sequence) or len(pair) != 2 for pair in pairs.values()):
+        raise QPError.expected(name, repr(dict(pairs)), "pairs (lower, upper) by name")
+    numbers = {
+        key: [None if isinstance(x, str) else x for x in pair] for key, pair in pairs.items()
+    }
+    limits = {
+        key: (lower if isinstance(lower, str) else "", upper if isinstance(upper, str) else "")
+        for key, (lower, upper) in pairs.items()
+    }
+    return numbers, {key: pair for key, pair in limits.items() if any(pair)}
 
 
 def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:

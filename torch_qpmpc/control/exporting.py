@@ -233,7 +233,11 @@ def _course(law: Law, known: Array) -> tuple[Course, Array]:
     size_y, size_u = design.usual, design.scaling.u
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
     x, start = at_rest(law.mpc, known)
-    d = known + 0.1 * design.scaling.d * rng.normal(size=(rows, len(known)))
+    moved = 0.1 * design.scaling.d * rng.normal(size=(rows, len(known)))
+    for of in design.limited:  # bounds are wider than at rest, so that there is a plan
+        for places, sign in zip(of, (-1, 1), strict=True):
+            moved[:, places[places >= 0]] = sign * np.abs(moved[:, places[places >= 0]])
+    d = known + moved
     noise = 0.01 * size_y * rng.normal(size=(COMPARED + 1, len(size_y)))
     r = centre(design, known) + moves * size_y
     ahead = np.arange(COMPARED + 1)[:, None] + np.arange(stages)
@@ -283,7 +287,7 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop) -> dict[str, str]:
     tables = [array(key, x, dtype) for key, x in _tables(law, dtype).items()]
     indices = {
         f"OF_{key}": np.flatnonzero(mask) for key, mask in zip("YU", design.bounded, strict=True)
-    }
+    } | dict(zip(("LOWER_OF", "UPPER_OF"), design.limited[1], strict=True))
     tables += [
         f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
         for key, x in indices.items()
@@ -350,6 +354,7 @@ def _tables(law: Law, dtype: str) -> dict[str, Array]:
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
         "ACTS": design.plant.E.any(0).astype(float),
+        "NOMINAL": design.nominal,
         "U_LOWER": design.u_bounds[0],
         "U_UPPER": design.u_bounds[1],
         **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(law.mpc, dtype), strict=True)),

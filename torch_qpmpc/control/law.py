@@ -159,28 +159,30 @@ class Law:
         design, (memory, e, status) = self.design, self._seen(memory, y, known)
         if valid := self._are_plausible(r, 0).all():
             memory = memory._replace(r=r)
+        u = self._within(memory.u, memory)
+        held = self._after(memory, e, u)
         if e is None or status == Outcome.INVALID or not valid:
-            return Move(memory.u, self._after(memory, e, memory.u), Outcome.INVALID)
+            return Move(u, held, Outcome.INVALID)
         x, w = np.split(e, [len(design.plant.A)])
-        mpc, held, level = self.mpc, self._after(memory, e, memory.u), known.mean(0)
+        mpc, level = self.mpc, known.mean(0)
         previewed, aimed = design.references == "preview", []
         for row in r if previewed else r[:1]:
             if (target := self._aimed(row, w, level)) is None:
-                return Move(memory.u, held, Outcome.INFEASIBLE)
+                return Move(u, held, Outcome.INFEASIBLE)
             aimed.append(target)
         target = Target(*map(torch.stack, zip(*aimed, strict=True))) if previewed else aimed[0]
         p = mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
         plan = self.plans.solve(p.numpy()[None])
         if plan.status[0]:
             proved = plan.status[0] == Status.INFEASIBLE
-            return Move(memory.u, held, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
+            return Move(u, held, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
         u = aimed[-1].u.numpy() + plan.z[0, mpc.n_p : mpc.n_p + mpc.n_u]
-        u = np.clip(u, *design.u_bounds)
+        u = self._within(u, memory)
         return Move(u, self._after(memory, e, u), status, target, p)
 
     def _aimed(self, r: Array, w: Array, level: Array) -> Target | None:
         """Return `LinearMPC.target` of one set-point; None if a QP has no solution."""
-        loads, v, known = np.concatenate((w, level, [1.0])), np.zeros(0), r
+        loads, v, known = np.concatenate((w, level - self.design.nominal, [1.0])), np.zeros(0), r
         for aims in self.aims:
             state = np.concatenate((known, loads))
             solution = aims.solve(state[None])
@@ -233,7 +235,14 @@ class Law:
         if e is not None:
             assert memory.known is not None
             e = self.observer.predicted(e, u, memory.known)
-        return memory._replace(u=np.clip(u, *self.design.u_bounds), e=e)
+        return memory._replace(u=self._within(u, memory), e=e)
+
+    def _within(self, u: Array, memory: Memory) -> Array:
+        """Return inputs within their bounds, as known signals have them now."""
+        bounds = self.design.u_bounds
+        return np.clip(
+            u, *(bounds if memory.known is None else self.design.bounds_at(memory.known)[1])
+        )
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""

@@ -13,7 +13,15 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.checks import check_whole
-from torch_qpmpc.control.design import Design, read_bounds, read_moves, read_prices, read_weight
+from torch_qpmpc.control.design import (
+    Design,
+    read_bounds,
+    read_limits,
+    read_moves,
+    read_prices,
+    read_weight,
+    signals_of,
+)
 from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import Affine, LinearScheme, free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
@@ -59,7 +67,8 @@ class LinearMPC(Affine):
         horizon: N.
         Q, R, dR: weights by name, as a number, a vector or a matrix; zero by default.
         y_bounds, u_bounds, du_bounds: pairs (lower, upper) by name, or one pair; unbounded by
-            default. Bounds of inputs and moves are hard.
+            default. Bounds of inputs and moves are hard. A bound of an output or input may be the
+            name of a known signal that acts on no state: it then varies over the horizon.
         y_slack: the price of a unit of violation of an output's bounds; inf makes them hard. By
             default a violation by half the distance of the bounds costs 1000 times as much as a
             stage with all signals that far off the target.
@@ -125,12 +134,13 @@ class LinearMPC(Affine):
             self._start_targets()
             return
         check_keywords("LinearMPC", options, [*KEYWORDS, *signature(LinearMPC).parameters])
-        prices = linear.values() if isinstance(linear, Mapping) else ()
+        prices = [*linear.values()] if isinstance(linear, Mapping) else []
+        prices += [*signals_of(y_bounds), *signals_of(u_bounds)]
         plant = read_model(model, E, dt, inputs, outputs, known, prices)
         check_whole("horizon", horizon, 1)
         weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
-        wishes = read_wishes(plant, **weights, **bounds)
+        wishes = read_wishes(plant, {}, **weights, **bounds)
         limits = wishes["y_bounds"], wishes["u_bounds"], wishes["Q"]
         scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
@@ -171,7 +181,8 @@ class LinearMPC(Affine):
         if self.learned:
             got, remedy = f"an MPC that learns {', '.join(self.learned)}", "Change its parameters."
             raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
-        design = replace(self.design, **read_wishes(self.design.plant, **changes))
+        plant, limits = self.design.plant, self.design.limits
+        design = replace(self.design, **read_wishes(plant, limits, **changes))
         return LinearMPC(lowered(design), **{name: self.arguments[name] for name in KEYWORDS})
 
     def extra_repr(self) -> str:
@@ -221,7 +232,7 @@ class LinearMPC(Affine):
         mpc.load_state_dict(content["mpc"])
         return mpc
 
-    def target(self, r: Any, w: Any = 0.0, known: Any = 0.0) -> Target:
+    def target(self, r: Any, w: Any = 0.0, known: Any = None) -> Target:
         """Return the steady states within the bounds that are nearest to set-points.
 
         The inputs exceed their bounds as little as possible if no steady state of a plant that
@@ -230,7 +241,8 @@ class LinearMPC(Affine):
         Args:
             r: ``(*batch, n_y)``.
             w: the disturbances ``(*batch, n_w)``, or a number for all.
-            known: the level of the known signals, ``(*batch, n_d)``, or a number for all.
+            known: the level of the known signals, ``(*batch, n_d)``, or a number for all; by
+                default `Design.nominal`.
 
         Raises:
             QPError: a shape is wrong.
@@ -253,13 +265,14 @@ class LinearMPC(Affine):
         """Return [r; w; d; 1] ``(*batch, n_y + n_w + n_d + 1)``."""
         sizes = {"r": len(self.design.Q), "w": len(self.design.disturbances.names)}
         sizes["known"] = self.design.plant.sizes[3]
-        parts = {"r": r, "w": w, "known": known}
+        parts = {"r": r, "w": w, "known": self.design.nominal if known is None else known}
         parts = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in parts.items()}
         for name, part in parts.items():
             if part.ndim and part.shape[-1] != sizes[name]:
                 got, want = f"shape {tuple(part.shape)}", f"(*batch, {sizes[name]})"
                 raise QPError.expected(name, got, want)
         batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
+        parts["known"] = parts["known"] - torch.from_numpy(self.design.nominal)
         parts = [part.expand(*batch, sizes[name]) for name, part in parts.items()]
         return torch.cat((*parts, parts[0].new_ones(*batch, 1)), -1)
 
@@ -271,7 +284,8 @@ class LinearMPC(Affine):
             target: the `target`; with a preview of references one for each stage,
                 ``(*batch, N + 1, ..)``; p is relative to the last one.
             signals: ``u_last`` ``(*batch, m)``, u_s if left out; ``known`` ``(*batch, N + 1, n_d)``
-                and the ``level`` ``(*batch, n_d)`` that the target is for; zero if left out.
+                and the ``level`` ``(*batch, n_d)`` that the target is for; by default
+                zero, and bounds as `Design.nominal`.
 
         Raises:
             QPError: a name or a shape is wrong.
@@ -279,10 +293,13 @@ class LinearMPC(Affine):
         places, n_d = self.design.places, self.n_d
         if unknown := sorted(signals.keys() - {"u_last", "known", "level"}):
             raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known, level")
+        x = torch.as_tensor(x, dtype=torch.float64)
         values = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in signals.items()}
-        if (level := values.pop("level", None)) is not None:
+        level = values.pop("level", x.new_zeros(()))
+        if "known" in values and values["known"].shape[-1] == self.design.plant.sizes[3]:
             loads = torch.from_numpy(self.design.plant.E.any(0))
-            values["known"] = values["known"] - (level * loads).unsqueeze(-2)
+            rest = level * loads + torch.from_numpy(self.design.nominal)
+            values["known"] = values["known"] - rest.unsqueeze(-2)
         base = target
         if self.design.references == "preview":
             base = Target(*(part[..., -1, :] for part in target))
@@ -290,7 +307,6 @@ class LinearMPC(Affine):
                 "r": target.y - target.y[..., -1:, :],
                 "u_r": target.u - target.u[..., -1:, :],
             }
-        x = torch.as_tensor(x, dtype=torch.float64)
         values |= {"x": x - base.x, "u_last": values.get("u_last", base.u) - base.u}
         y, u = (torch.from_numpy(mask) for mask in self.design.bounded)
         values |= {"y_s": base.y[..., y], "u_s": base.u[..., u], "one": x.new_ones(())}
@@ -309,8 +325,10 @@ class LinearMPC(Affine):
         return torch.cat((d.flatten(-2), state), -1)
 
 
-def read_wishes(plant: StateSpace, **wishes: Any) -> dict[str, Any]:
-    """Read weights and bounds by their arguments' names in `LinearMPC`.
+def read_wishes(
+    plant: StateSpace, limits: dict[str, tuple[str, str]], **wishes: Any
+) -> dict[str, Any]:
+    """Read weights and bounds by their arguments' names in `LinearMPC`, with new limits.
 
     Raises:
         QPError: one is invalid, or has another name.
@@ -326,7 +344,11 @@ def read_wishes(plant: StateSpace, **wishes: Any) -> dict[str, Any]:
         "du_bounds": lambda _, value: read_moves(value, u),
     }
     check_keywords("redesign", wishes, [*readers])
-    return {name: readers[name](name, value) for name, value in wishes.items()}
+    for name, names in {"y_bounds": y, "u_bounds": u}.items():
+        if name in wishes:
+            wishes[name], own = read_limits(name, wishes[name], names, plant)
+            limits = {key: pair for key, pair in limits.items() if key not in names} | own
+    return {name: readers[name](name, x) for name, x in wishes.items()} | {"limits": limits}
 
 
 def _shifted(place: slice, by: int) -> slice:

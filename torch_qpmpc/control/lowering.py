@@ -61,10 +61,11 @@ class LinearScheme(Scheme):
 
     @property
     def of_actions(self) -> Tensor:
-        """True for the rows of inputs and moves, whose other entries are constant in a block."""
+        """True for rows of inputs and moves without known signals: constant in a block."""
         if self.bounds.constraints is None:
             return super().of_actions
-        return self.bounds.constraints[0][:, -self.layout.n_u :].any(-1)
+        D, layout = self.bounds.constraints[0], self.layout
+        return D[:, -layout.n_u :].any(-1) & ~D[:, : layout.n_d].any(-1)
 
 
 class Affine(QPMPC):
@@ -170,18 +171,20 @@ def _bounds(design: Design) -> Bounds:
     s, size = design.selectors(), design.places["u"].start
     moving = np.isfinite(design.du_bounds).any(0)
     of_y, of_u = design.bounded
-    y = (design.plant.C @ s["x"])[of_y] + s["y_s"]
-    du = s["u"][moving] - s["u_last"][moving] if moving.any() else y[:0]
-    D = np.vstack((y, s["u"][of_u] + s["u_s"], du))
-    sides = ((design.y_bounds, of_y), (design.u_bounds, of_u), (design.du_bounds, moving))
-    lower, upper = (
-        np.concatenate([bounds[side][rows] for bounds, rows in sides]) for side in (0, 1)
-    )
-    n_y = len(y)
-    price = design.y_slack[of_y]
+    y, u = design.plant.C @ s["x"], s["u"].copy()
+    y[of_y] += s["y_s"]
+    u[of_u] += s["u_s"]
+    *soft, places = design.rows(0, y, s["known"])
+    priced = design.y_slack[places] > 0
+    soft = [part[priced] for part in soft]
+    *hard, _ = design.rows(1, u, s["known"])
+    du = s["u"][moving] - s["u_last"][moving] if moving.any() else u[:0]
+    limits = du, *(side[moving] for side in design.du_bounds)
+    D, lower, upper = map(np.concatenate, zip(soft, hard, limits, strict=True))
+    n_y, price = len(soft[0]), design.y_slack[places][priced]
     return Bounds(
         constraints=(D, lower, upper) if len(D) else None,
-        terminal_constraints=(y[:, :size], lower[:n_y], upper[:n_y]) if n_y else None,
+        terminal_constraints=(soft[0][:, :size], *soft[1:]) if n_y else None,
         constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
         discount_slack=True,
     )
@@ -205,28 +208,27 @@ def target_mpc(design: Design) -> QPMPC:
     weight = 2 * error.T @ design.Q @ error
     if len(steady.W) and not split:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
-    lower, upper = design.u_bounds
-    rows = (np.isfinite(lower) | np.isfinite(upper)) & inputs[:, n_x:].any(-1)
     y, u, _, d = design.scaling
-    D, of_s = inputs[rows] / u[rows, None], np.concatenate((y, design.of_w(y), d, [1.0]))
+    K = np.eye(len(d), error.shape[1], n_x - 1 - len(d))
+    D, lower, upper, of = design.rows(1, inputs, K)
+    moved, of_s = D[:, n_x:].any(-1), np.concatenate((y, design.of_w(y), d, [1.0]))
+    D, lower, upper = ((part.T / u[of]).T[moved] for part in (D, lower, upper))
     D[:, :n_x] *= of_s
-    rows = D, lower[rows] / u[rows], upper[rows] / u[rows]
     if split:
-        rows = _without_last(*rows, len(steady.W))
-    D, lower, upper = rows
+        D, lower, upper = _without_last(D, lower, upper, len(steady.W))
     D[:, :n_x] /= of_s
-    lower_y, upper_y = design.y_bounds
     error[:, :n_y] = 0.0
-    soft = (np.isfinite(lower_y) | np.isfinite(upper_y)) & error[:, n_x : n_x + n_v].any(-1)
+    *soft, of = design.rows(0, error[:, : n_x + n_v], K[:, : n_x + n_v])
+    moved = soft[0][:, n_x:].any(-1)
     price = np.full(len(D), np.inf)
     if np.linalg.matrix_rank(steady.U / u[:, None], RANK) < len(u):
         # The plant integrates, and a load may have no steady inputs within bounds.
         price[:] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
-    slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[soft])
-    D = np.vstack((D[:, : n_x + n_v], error[soft, : n_x + n_v]))
-    lower, upper = np.append(lower, lower_y[soft]), np.append(upper, upper_y[soft])
+    slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[of[moved]])
+    rows = zip((D[:, : n_x + n_v], lower, upper), soft, strict=True)
+    rows = tuple(np.concatenate((of_u, of_y[moved])) for of_u, of_y in rows)
     weight = weight[: n_x + n_v, : n_x + n_v]
-    return _of_one_stage(n_x, weight, SCALE * design.typical, (D, lower, upper), slack)
+    return _of_one_stage(n_x, weight, SCALE * design.typical, rows, slack)
 
 
 def free_mpc(design: Design) -> QPMPC | None:
@@ -235,9 +237,10 @@ def free_mpc(design: Design) -> QPMPC | None:
         return None
     steady, n_a = design.steady, design.steady.n_a
     n_x = n_a + steady.u.shape[1]
-    bounded = design.bounded[1]
+    n_d = design.plant.sizes[3]
     D = np.hstack((steady.U[:, :n_a], steady.u, steady.U[:, n_a:]))
-    D, *sides = (((part.T / design.scaling.u).T)[bounded] for part in (D, *design.u_bounds))
+    *rows, of = design.rows(1, D, np.eye(n_d, D.shape[1], n_x - 1 - n_d))
+    D, *sides = ((part.T / design.scaling.u[of]).T for part in rows)
     size = float(np.linalg.norm(steady.W, 2))
     slack = np.full(len(D), NEARLY_HARD * size)
     weight = block_diag(np.zeros((n_x, n_x)), 2 * steady.W)

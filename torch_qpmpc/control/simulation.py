@@ -75,7 +75,8 @@ class Run:
             known = isinstance(price, str)
             level = self.known[:, design.plant.known.index(price)] if known else price
             cost = cost + level * self.u[:, design.plant.inputs.index(name)]
-        outside = np.maximum(np.maximum(design.y_bounds[0] - y, y - design.y_bounds[1]), 0.0)
+        lower, upper = design.bounds_at(self.known)[0]
+        outside = np.maximum(np.maximum(lower - y, y - upper), 0.0)
         prices = np.where(outside > 0, design.y_slack, 0.0)  # inf times zero is none
         return cost + (prices * outside).sum(1)
 
@@ -92,7 +93,8 @@ class Run:
             plant.label(name): torch.from_numpy(x)
             for name, x in zip(plant.known, self.known.T.copy(), strict=True)
         }
-        lower, upper = (torch.from_numpy(x) for x in self.design.y_bounds)
+        known = np.vstack((self.known, self.known[-1:]))
+        lower, upper = map(torch.from_numpy, self.design.bounds_at(known)[0])
         return episode_figure(
             times,
             y,
@@ -222,8 +224,8 @@ class _Model:
 
 
 def last_known(design: Design, memory: Memory) -> Array:
-    """Return the known signals of the last step or reset, ``(n_d,)``, zero before."""
-    return np.zeros(len(design.plant.known)) if memory.known is None else memory.known
+    """Return the known signals of the last step or reset, `Design.nominal` before, ``(n_d,)``."""
+    return design.nominal if memory.known is None else memory.known
 
 
 def centre(design: Design, known: Array) -> Array:

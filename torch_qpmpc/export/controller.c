@@ -41,9 +41,14 @@ static int are_sane(const real *x, const real most[], int rows, int columns)
     return 1;
 }
 
-static real within(real x, int i)
+/* Return x within the bounds of input i, some of which are known signals: in the last valid row. */
+static real within(const policy_state *s, real x, int i)
 {
-    return x < U_LOWER[i] ? U_LOWER[i] : x > U_UPPER[i] ? U_UPPER[i] : x;
+    int seen = s->starts < 2;
+    real lower = seen && LOWER_OF[i] >= 0 ? s->known[LOWER_OF[i]] : U_LOWER[i];
+    real upper = seen && UPPER_OF[i] >= 0 ? s->known[UPPER_OF[i]] : U_UPPER[i];
+    if (x < lower) x = lower;
+    return x > upper ? upper : x;
 }
 
 /* Predict the estimates of the next step with the input u. */
@@ -76,7 +81,10 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
 {
     real error[N_Y];
     int i, j, missing = 0, valid = are_sane(known, MOST_KNOWN, stages, N_D);
-    if (valid) copy(s->known, known, N_D);
+    if (valid) {
+        copy(s->known, known, N_D);
+        if (s->starts) s->starts = 1;
+    }
     if (s->starts) {
         if (!valid || !y || !are_sane(y, MOST_Y, 1, N_Y)) return POLICY_INVALID;
         rest(s, y);
@@ -133,7 +141,7 @@ static int plan(policy_state *s, const real known[])
     real level[POLICY_N_D_] = {0}, move[N_U], *p = s->p;
     int i, k, code;
     for (i = 0; i < N_D; i++) {
-        for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i];
+        for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i] - NOMINAL[i];
         level[i] /= (real)STAGES;
     }
     for (k = 0; k < SET_POINTS; k++) {
@@ -144,7 +152,7 @@ static int plan(policy_state *s, const real known[])
     for (k = 0; k < STAGES; k++) {
         for (i = 0; i < N_R; i++) *p++ -= s->y_s[i];
         for (i = 0; i < N_UR; i++) *p++ -= s->u_s[i];
-        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - ACTS[i] * level[i];
+        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - NOMINAL[i] - ACTS[i] * level[i];
     }
     for (i = 0; i < N_X; i++) *p++ = s->e[i] - s->x_s[i];
     for (i = 0; i < POLICY_MOVES; i++) *p++ = s->u[i] - s->u_s[i];
@@ -153,7 +161,7 @@ static int plan(policy_state *s, const real known[])
     *p = 1;
     if ((code = policy_plan_step(&s->plan, s->p, move, 0)) != POLICY_SOLVED) return code;
     for (i = 0; i < N_U; i++) {
-        real by = (move[i] = within(s->u_s[i] + move[i], i)) - s->u[i];
+        real by = (move[i] = within(s, s->u_s[i] + move[i], i)) - s->u[i];
         if (!(by >= MOVE_LOWER[i] && by <= MOVE_UPPER[i])) return POLICY_LIMIT;
     }
     copy(s->u, move, N_U);
@@ -170,9 +178,9 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
     for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;
-    for (i = 0; i < N_U; i++) s->u[i] = within(u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
+    s->starts = 2;
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
-    s->starts = 1;
     if (y && are_sane(y, MOST_Y, 1, N_Y) && (!N_D || (known && are_sane(known, MOST_KNOWN, 1, N_D)))) {
         copy(s->known, known, N_D);
         rest(s, y);
@@ -186,15 +194,16 @@ int policy_observe(policy_state *s, const real y[], const real u[], const real k
     real applied[N_U];
     for (i = 0; i < N_U; i++) applied[i] = u && is_sane(u[i], MOST_U[i]) ? u[i] : s->u[i];
     if (!s->starts) predict(s, applied);
-    for (i = 0; i < N_U; i++) s->u[i] = within(applied[i], i);
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, applied[i], i);
     return code;
 }
 
 int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
 {
-    int code, seen = see(s, y, known, STAGES), sane = !r || are_sane(r, MOST_Y, SET_POINTS, N_Y);
+    int i, code, seen = see(s, y, known, STAGES), sane = !r || are_sane(r, MOST_Y, SET_POINTS, N_Y);
     if (r && sane) copy(s->r, r, SET_POINTS * N_Y);
     code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
     if (!s->starts) predict(s, s->u);
     copy(u, s->u, N_U);
     return code ? code : seen;

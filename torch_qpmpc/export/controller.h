@@ -38,7 +38,7 @@ typedef struct {
 #if POLICY_N_F
     policy_free_state free;
 #endif
-    int starts;                                  /* 1 before there are estimates */
+    int starts;                                  /* 1 before there are estimates, 2 before known signals */
 } policy_state;
 
 /* A number is missing if it is not finite, or above MOST_Y, MOST_KNOWN or MOST_U of policy.c, 1e8
