@@ -33,7 +33,7 @@ def test_commands_of_claims_have_possible_settings():
 
 @needs_docs
 def test_the_campaigns_page_has_every_family():
-    page = (ROOT / "docs/reliability/campaign.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reliability/measured.md").read_text(encoding="utf-8")
     rows = page.split("<!-- campaign-families -->")[1].split("<!-- /campaign-families -->")[0]
     named = [row.split(" | ")[0].removeprefix("| ") for row in rows.splitlines() if row]
     assert sorted(", ".join(named[2:]).split(", ")) == sorted(FAMILIES)

@@ -162,6 +162,21 @@ def test_the_readmes_numbers_are_those_of_the_pages():
             assert {*numbers} <= cells, f"{page}: {row}"
 
 
+GUIDES = [x for x in PAGES if x.startswith("docs/guides/") and "troubleshooting" not in x]
+
+
+@pytest.mark.parametrize("page", GUIDES)
+def test_a_guide_is_short_begins_with_a_script_and_has_a_picture(page):
+    text = PAGES[page]
+    assert len(text.split()) <= 1000
+    first, *_ = re.findall(r"^(#{2,}|```python|```bash)", text, re.MULTILINE)
+    assert first.startswith("```")
+    assert len(text.split("```")[0].split()) <= 70
+    shown = re.findall(r"!\[.+\]\((.+?)\)", text)
+    assert shown
+    assert all((DOCS / "guides" / picture).exists() for picture in shown)
+
+
 @needs_docs
 def test_the_readme_is_short_and_its_links_lead_somewhere():
     readme = PAGES["README.md"]

@@ -28,7 +28,7 @@ from torchrl.modules import AdditiveGaussianModule
 
 import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
-from tests.benchmarks.problems import GAMMA, PAPER, make_mpc, nudge, transitions
+from tests.benchmarks.problems import GAMMA, PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
 from tests.benchmarks.table import significant
 from torch_qpmpc.envs import PointMass, PointMassEnv
@@ -39,7 +39,7 @@ from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 GPU = torch.device("cuda")
-BATCHES = (1, 256, 4_096, 16_384, 65_536, 262_144)
+BATCHES = (1, 4_096, 65_536, 262_144)
 #: The batch of the comparison, and of the rows of qpax, which needs more memory.
 LARGE, OF_QPAX = 65_536, 16_384
 ROUNDS = 7
@@ -86,9 +86,6 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
             cold = seconds(lambda s=s: mpc.value(s))
             memory = torch.cuda.max_memory_allocated() / 2**20 if device.type == "cuda" else 0
             warm = seconds(lambda s=s, x=first.active: mpc.solve(s, warm_start=x))
-            new = seconds(
-                lambda s=s, x=first.active: mpc.solve(s, warm_start=x), lambda: nudge(mpc)
-            )
 
         def gradient(value: Callable[[], Tensor]) -> float:
             def run() -> None:
@@ -99,9 +96,9 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
 
         of_Q = gradient(lambda s=s, a=a: mpc.action_value(s, a))
         of_pi = gradient(lambda s=s: mpc.policy(s))
-        times = (significant(1e6 * x / batch) for x in (cold, warm, new, of_Q, of_pi))
+        times = (significant(1e6 * x / batch) for x in (cold, warm, of_Q, of_pi))
         lines.append([f"{batch:,}", *times, f"{memory:,.0f}; {error:.0e}"])
-    head = ["batch", "V", "V, warm", "warm, new theta", "Q and gradient", "policy and gradient"]
+    head = ["batch", "V", "V, warm", "Q and gradient", "policy and gradient"]
     return table([*head, "MiB; error"], lines)
 
 

@@ -1,4 +1,4 @@
-"""The whole loop of train.py: transitions a second, and the solver's share of the time.
+"""The whole loop of train.py: transitions a second.
 
     python -m tests.benchmarks.loop --write
 
@@ -9,7 +9,6 @@ the wall clock; the kernels' compilation does not count.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import subprocess
 import sys
@@ -23,29 +22,21 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "benchmarks.md"
 ENVIRONMENTS, UPDATES, STEPS = (16, 256, 4096), 25, 4
 QUIET = ("constraint=deviation", "gate=false", "figures=false", "rivals=false")
-TITLES = ["solver", "threads", "environments", "transitions a second", "ms an update"]
-TITLES += ["collection", "solver's share"]
+TITLES = ["solver", "environments", "transitions a second", "ms an update"]
 
 
-def measured(solver: str, threads: int, count: int) -> list[str]:
+def measured(solver: str, count: int) -> list[str]:
     """Run train.py; return a row."""
     sizes = (f"num_envs={count}", f"replay_capacity={100 * count}", f"steps_per_update={STEPS}")
     length = (f"updates={UPDATES}", f"eval_interval={UPDATES}", "log_interval=1")
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        keys = [f"solver={solver}", f"threads={threads}", f"hydra.run.dir={run}"]
+        keys = [f"solver={solver}", f"hydra.run.dir={run}"]
         command = [sys.executable, "train.py", *keys, *sizes, *length, *QUIET]
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
         seconds = json.loads((run / "summary.json").read_text(encoding="utf-8"))["train_seconds"]
-        with (run / "metrics.csv").open(encoding="utf-8") as file:
-            lines = [line for line in csv.DictReader(file) if line["time/qp"]]
-    solving, collecting = (
-        sum(float(line[name]) for line in lines) for name in ("time/qp", "time/collect")
-    )
     rate = UPDATES * STEPS * count / seconds
-    shares = [f"{collecting / seconds:.0%}", f"{solving / seconds:.0%}"]
-    times = [significant(rate), significant(1e3 * seconds / UPDATES)]
-    return [solver, str(threads), f"{count:,}", *times, *shares]
+    return [solver, f"{count:,}", significant(rate), significant(1e3 * seconds / UPDATES)]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -53,9 +44,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args(arguments)
     rows = []
-    for solver, threads in (("daqp", 1), ("daqp", 2), ("proxqp", 1), ("proxqp", 2)):
+    for solver in ("daqp", "proxqp"):
         for count in ENVIRONMENTS:
-            rows.append(measured(solver, threads, count))
+            rows.append(measured(solver, count))
             print(" | ".join(rows[-1]), flush=True)
     if options.write:
         text = replaced(PAGE.read_text(encoding="utf-8"), table(TITLES, rows), "loop")

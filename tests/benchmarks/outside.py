@@ -446,11 +446,10 @@ def outcomes(rows: Any) -> str:
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse = (runs["excess"] > ERRORS * runs["error"]).sum()
         names = (name.removesuffix(", first log") for name in runs["chosen"])
-        orders = ", ".join(map(str, runs["order"]))
-        tail = [f"{worse} of {len(runs)}", "; ".join(dict.fromkeys(names)), orders]
+        tail = [f"{worse} of {len(runs)}", "; ".join(dict.fromkeys(names))]
         lines.append([name, *cells, *tail])
     head = ["plant", "zero action", "start, median", "worst", "reference"]
-    return table([*head, "worse than zero action", "chosen", "states"], lines)
+    return table([*head, "worse than zero action", "chosen"], lines)
 
 
 def learning(rows: Any) -> str:
@@ -516,9 +515,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 add(options.results, row | (new := learned(name, seed, row["start"])))
                 print(name, seed, *new.values(), flush=True)
     rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
-    for marker, content in {"starts": outcomes(rows), "learned": learning(rows)}.items():
-        text = replaced(text, content, marker)
-    options.page.write_text(text, encoding="utf-8")
+    tables = [outcomes(rows), learning(rows)] if rows["learned"].notna().any() else [outcomes(rows)]
+    options.page.write_text(replaced(text, "\n\n".join(tables), "starts"), encoding="utf-8")
 
 
 if __name__ == "__main__":

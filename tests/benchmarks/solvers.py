@@ -1,4 +1,4 @@
-"""Solvers side by side as the horizon and the state grow.
+"""Solvers side by side as the horizon grows.
 
     pip install clarabel piqp osqp qpax cvxpylayers
     python -m tests.benchmarks.solvers --write
@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +40,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 #: QPs in our batches, in the others' loops, and compared with the reference.
 BATCH, LOOP, CHECKED = 32, 4, 2
 ROUNDS, PATIENCE = 5, 1.0
-HORIZONS = (5, 10, 20, 50, 100, 200)
-STATES = ((4, 2), (8, 2), (16, 4), (32, 8))
-#: Sizes of each series, by its caption.
-SERIES = {
-    "n_x = 4, n_u = 2, by N": [Size(N, 4, 2) for N in HORIZONS],
-    "N = 20, by (n_x, n_u)": [Size(20, *dimensions) for dimensions in STATES],
-}
+#: The columns: whether C is dense, and N, which grows.
+CASES = ((False, 20), (False, 200), (True, 5), (True, 20), (True, 100))
 
 Solve = Callable[[], Tensor]
 
@@ -163,23 +157,22 @@ def timed(solve: Solve) -> tuple[float, Tensor]:
     return time.process_time() - began, result
 
 
-def series(caption: str, sizes: list[Size], dense: bool) -> str:
-    left_out: set[str] = set()
+def series() -> str:
+    left_out: dict[bool, set[str]] = {False: set(), True: set()}
     columns = []
-    for size in sizes:
-        columns.append(measured(size, dense, left_out))
+    for dense, horizon in CASES:
+        size = Size(horizon, 4, 2)
+        columns.append(measured(size, dense, left_out[dense]))
         for name, (taken, error) in columns[-1].items():
             said = "" if error is None else f", error {error:.0e}"
             print(f"{size}, {name}: {1e3 * taken:.3g} ms{said}", flush=True)
-    by_horizon = len({size.horizon for size in sizes}) > 1
-    heads = [str(s.horizon) if by_horizon else f"({s.n_x}, {s.n_u})" for s in sizes]
     lines = []
     for name in dict.fromkeys(name for column in columns for name in column):
         cells = [significant(1e3 * column[name][0]) if name in column else "" for column in columns]
         largest = [e for c in columns if name in c and (e := c[name][1]) is not None]
         lines.append([name + (f" ({max(largest):.0e})" if largest else ""), *cells])
-    kind = "dense C" if dense else "banded C"
-    return f"**{kind}, {caption}**\n\n{table(['', *heads], lines)}"
+    head = [f"{'dense' if dense else 'banded'}, N = {horizon}" for dense, horizon in CASES]
+    return table(["", *head], lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -188,12 +181,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
-    cases = product(SERIES.items(), (False, True))
-    tables = [series(caption, sizes, dense) for (caption, sizes), dense in cases]
+    times = series()
     packages = ["daqp", "proxsuite", "torch", *(p for p, _ in PEERS.values()), LAYERS]
     versions = ", ".join(f"{name} {version(name)}" for name in packages if find_spec(name))
     text = "\n\n".join(
-        [f"Milliseconds a QP, with {versions}. In brackets the largest error of a value.", *tables]
+        [f"Milliseconds a QP, with {versions}. In brackets the largest error of a value.", times]
     )
     print(text)
     if options.write:

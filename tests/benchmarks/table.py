@@ -19,6 +19,8 @@ DOCS = ROOT / "docs"
 PAGE = DOCS / "benchmarks.md"
 RESULTS = ROOT / "runs" / "benchmark.json"
 REFERENCE = "ProxSuite's QPFunction"
+#: The columns of times: whether C is dense, and the batch.
+CASES = ((True, 1), (True, 256), (True, 1024), (False, 256))
 
 Row = dict[str, Any]
 
@@ -56,14 +58,9 @@ def tables(results: dict[str, Any]) -> str:
         {**b["extra_info"], "test": b["name"].split("[")[0], "seconds": b["stats"]["median"]}
         for b in results["benchmarks"]
     ]
-
-    def of(test: str) -> list[Row]:
-        return [row for row in rows if row["test"] == test]
-
     parts = [
         conditions(results["machine_info"]),
-        gradients(of("test_gradient")),
-        overhead(of("test_share_outside_the_solver"), of("test_decisions")),
+        gradients([row for row in rows if row["test"] == "test_gradient"]),
     ]
     return "\n\n".join(part for part in parts if part)
 
@@ -90,26 +87,25 @@ def gradients(rows: list[Row]) -> str:
     caption = (
         "**One Q-learning gradient**: V on the next states, Q on the visited pairs, and the "
         "gradient in all of theta; in ms, and in brackets how many times as fast as ProxSuite's "
-        "layer, whose rounds are between those of each row up to batch 256. On the right the "
-        "largest relative errors, of a value, with how many are wrong by more than 1e-6, and of "
-        "the gradient as a vector."
+        "layer, which takes turns with each row up to batch 256. C is dense unless a column says "
+        "banded. On the right, for a dense C, the largest relative errors of a value, with how "
+        "many are wrong by more than 1e-6, and of the gradient as a vector."
     )
-    kinds = ([row for row in rows if row["dense"] == dense] for dense in (True, False))
-    return "\n\n".join((caption, *(_gradients(of_kind) for of_kind in kinds if of_kind)))
-
-
-def _gradients(rows: list[Row]) -> str:
-    batches = _unique(row["batch"] for row in rows)
-    own = {row["batch"]: row["seconds"] for row in rows if row["row"] == REFERENCE}
+    own = {_case(row): row["seconds"] for row in rows if row["row"] == REFERENCE}
     lines = []
     for name in _unique(row["row"] for row in rows):
-        mine = {row["batch"]: row for row in rows if row["row"] == name}
-        cells = [_timing(mine[n], own.get(n)) if n in mine else "" for n in batches]
-        worst = max(mine.values(), key=lambda row: (row["wrong"], row["value_error"]))
-        gradient = max(row["gradient_error"] for row in mine.values())
+        mine = {_case(row): row for row in rows if row["row"] == name}
+        cells = [_timing(mine[x], own.get(x)) if x in mine else "" for x in CASES]
+        dense = [row for row in mine.values() if row["dense"]]
+        worst = max(dense, key=lambda row: (row["wrong"], row["value_error"]))
+        gradient = max(row["gradient_error"] for row in dense)
         lines.append([name, *cells, _errors(worst), f"{gradient:.0e}"])
-    head = [f"{_kind(rows[0])} C, batch of", *(f"{batch:,}" for batch in batches)]
-    return table([*head, "value", "gradient"], lines)
+    head = ["batch of", *(f"{batch:,}" + ("" if dense else ", banded") for dense, batch in CASES)]
+    return f"{caption}\n\n{table([*head, 'value', 'gradient'], lines)}"
+
+
+def _case(row: Row) -> tuple[bool, int]:
+    return row["dense"], row["batch"]
 
 
 def _timing(row: Row, own: float | None) -> str:
@@ -121,29 +117,6 @@ def _timing(row: Row, own: float | None) -> str:
 def _errors(row: Row) -> str:
     wrong = f", {row['wrong']:,} of {row['solved']:,} wrong" if row["wrong"] else ""
     return f"{row['value_error']:.0e}{wrong}"
-
-
-def _kind(row: Row) -> str:
-    return "dense" if row["dense"] else "banded"
-
-
-def overhead(shares: list[Row], decisions: list[Row]) -> str:
-    if not shares:
-        return ""
-    batches = _unique(row["batch"] for row in shares)
-    rates = {row["row"]: row["batch"] / row["seconds"] for row in decisions}
-    lines = []
-    for name in _unique(row["row"] for row in shares):
-        mine = {row["batch"]: row["outside"] for row in shares if row["row"] == name}
-        cells = [f"{mine[batch]:.0%}" if batch in mine else "" for batch in batches]
-        rate = f"{_round(rates[name]):,}" if name in rates else ""
-        lines.append([name, *cells, rate])
-    head = ["", *(f"outside, batch {batch}" for batch in batches), "decisions a second"]
-    caption = (
-        "**Overhead**: the share of a gradient's time outside the backend's calls, and the "
-        "policy's decisions a second, in batches of 32 with theta at rest."
-    )
-    return f"{caption}\n\n{table(head, lines)}"
 
 
 def _unique(items: Iterable[Any]) -> list[Any]:

@@ -1,7 +1,7 @@
 """Solve QPs whose outcome is known: ``python -m tests.campaign --count 100000 --solver daqp``.
 
 It ends with two tables in Markdown of the latest counts: all families together by solver, and each
-by itself. ``--write`` writes them to docs/reliability/campaign.md. ``--solver`` without a name
+by itself. ``--write`` writes them to docs/reliability/measured.md. ``--solver`` without a name
 solves nothing.
 """
 
@@ -39,7 +39,7 @@ OUTCOMES = {
     "missed": "not solved to tolerance",
     "wrong": "wrong",
 }
-PAGE = DOCS / "reliability" / "campaign.md"
+PAGE = DOCS / "reliability" / "measured.md"
 RESULTS = ROOT / "runs" / "campaign"
 
 

@@ -32,7 +32,6 @@ TITLES = (
     "largest difference of u",
     "of the value",
     "solved, infeasible, not certified",
-    "most iterations",
     "object, state",
 )
 
@@ -65,7 +64,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
         export = export_c(mpc, folder, storage=storage)
         library = Library(Path(folder), "policy", "float64")
         size = object_size(Path(folder))
-    counts, most, wrong, worst = np.zeros(3, dtype=int), 0, 0, np.zeros(2)
+    counts, wrong, worst = np.zeros(3, dtype=int), 0, np.zeros(2)
     warm = library.states(1)
     for start in range(0, count, CHUNK):
         part = p[start : start + CHUNK]
@@ -82,10 +81,9 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
             limit = steps.codes == 1
             wrong += int((~(solved | infeasible | limit)).sum())
             counts += [x.sum() for x in (solved, infeasible, limit)]
-            most = max(most, int(steps.iterations.max()))
     row = [name, f"{export.rows}", f"{worst[0]:.0e}", f"{worst[1]:.0e}"]
     row += [", ".join(f"{n}" for n in counts)]
-    row += [f"{most}", f"{size / 1e3:.0f}, {export.state_bytes / 1e3:.1f} kB"]
+    row += [f"{size / 1e3:.0f}, {export.state_bytes / 1e3:.1f} kB"]
     return row, not wrong and bool((worst <= LARGEST).all())
 
 
