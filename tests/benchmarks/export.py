@@ -36,7 +36,6 @@ PAGE = HERE.parents[1] / "docs" / "benchmarks.md"
 CHOSEN = (
     "point mass, N = 10",
     "12 states, 4 actions, N = 10",
-    "house, N = 32",
 )
 PASSES, COLD = 5, 1000
 #: Steps of the contenders in Python, and of OSQP.

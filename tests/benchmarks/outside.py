@@ -514,7 +514,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
             if options.learn and math.isnan(row["learned"]):
                 add(options.results, row | (new := learned(name, seed, row["start"])))
                 print(name, seed, *new.values(), flush=True)
-    rows, text = pd.read_csv(options.results), options.page.read_text(encoding="utf-8")
+    rows: Any = pd.read_csv(options.results)
+    text = options.page.read_text(encoding="utf-8")
     tables = [outcomes(rows), learning(rows)] if rows["learned"].notna().any() else [outcomes(rows)]
     options.page.write_text(replaced(text, "\n\n".join(tables), "starts"), encoding="utf-8")
 

@@ -1,6 +1,6 @@
 """The policy's gradient beside the solution and the value's gradient.
 
-    python -m tests.benchmarks.policy --write
+    python -m tests.benchmarks.policy
 
 CPU time on one thread with DAQP, the median of rounds in which the three take turns; theta moves
 in its last digits before each round. The bounded LQRs are those of Table 1 in
@@ -9,11 +9,8 @@ https://arxiv.org/abs/2505.01353: 128 initial states, N = 20, n_x = 8, n_u = 4.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -22,9 +19,8 @@ from torch import Tensor
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.table import significant
 from torch_qpmpc import QPMPC
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table
 
-PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 ROUNDS, WARM_UP, HORIZON = 30, 2, 20
 TITLES = ["batch", "solution", "value's gradient", "policy's gradient"]
 
@@ -89,22 +85,14 @@ def measured(mpc: QPMPC, states: Tensor) -> list[float]:
     return np.median(seconds[WARM_UP:], axis=0).tolist()
 
 
-def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.policy", description=__doc__)
-    parser.add_argument("--write", action="store_true", help="write the table into the docs")
-    options = parser.parse_args(arguments)
+def main() -> None:
     torch.set_num_threads(1)
     rows = []
     for name, (mpc, states) in PROBLEMS.items():
         times = [significant(1e3 * seconds) for seconds in measured(mpc, states)]
         rows.append([name, str(len(states)), *times])
-        print(" | ".join(rows[-1]), flush=True)
-    if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        text = replaced(page, table(["", *TITLES], rows), "policy")
-        PAGE.write_text(text, encoding="utf-8")
-    return 0
+    print(table(["", *TITLES], rows))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,7 +8,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -65,12 +65,6 @@ def tables(results: dict[str, Any]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def two_tables(head: Sequence[str], lines: Sequence[Sequence[str]], at: int) -> str:
-    """Format a table as two that fit a page: the second has column 0, and those from ``at`` on."""
-    first = table(head[:at], [line[:at] for line in lines])
-    return f"{first}\n\n{table([head[0], *head[at:]], [[line[0], *line[at:]] for line in lines])}"
-
-
 def conditions(machine: dict[str, Any]) -> str:
     cpu = machine.get("cpu", {})
     versions = ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
@@ -85,11 +79,10 @@ def gradients(rows: list[Row]) -> str:
     if not rows:
         return ""
     caption = (
-        "**One Q-learning gradient**: V on the next states, Q on the visited pairs, and the "
-        "gradient in all of theta; in ms, and in brackets how many times as fast as ProxSuite's "
-        "layer, which takes turns with each row up to batch 256. C is dense unless a column says "
-        "banded. On the right, for a dense C, the largest relative errors of a value, with how "
-        "many are wrong by more than 1e-6, and of the gradient as a vector."
+        "V on the next states, Q on the visited pairs, and the gradient in all of theta, in ms; in "
+        "brackets how many times as fast as ProxSuite's layer. On the right, for a dense C, the "
+        "largest relative errors: of a value, with how many are wrong by more than 1e-6, and of "
+        "the gradient."
     )
     own = {_case(row): row["seconds"] for row in rows if row["row"] == REFERENCE}
     lines = []
