@@ -201,6 +201,35 @@ class Design:
         )
         return (y[..., 0, :], y[..., 1, :]), (u[..., 0, :], u[..., 1, :])
 
+    def arranged(
+        self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any, level: Any
+    ) -> Any:
+        """Return `LinearMPC.arrange`, for signals of one batch shape in torch's or numpy's arrays.
+
+        Args:
+            arrays: ``torch`` or ``np``.
+            x, u_last: ``(*batch, n)`` and ``(*batch, m)``.
+            target: x_s, u_s and y_s, with a dimension for the stages if references are previewed.
+            known, level: ``(*batch, N + 1, n_d)`` and ``(*batch, n_d)``.
+        """
+        acts, nominal, of_y, of_u = (arrays.asarray(index) for index in self._indices)
+        known = known - (level * acts + nominal)[..., None, :]
+        if self.references == "preview":
+            _, u_r, y_r = target
+            target = [part[..., -1, :] for part in target]
+            ahead = [y_r - y_r[..., -1:, :], u_r - u_r[..., -1:, :]][: 1 + self.R.any()]
+            known = arrays.concatenate((*ahead, known), -1)
+        x_s, u_s, y_s = target
+        du = (u_last - u_s)[..., : len(self.R) if self.moves else 0]
+        parts = known.reshape(*known.shape[:-2], -1), x - x_s, du, y_s[..., of_y], u_s[..., of_u]
+        return arrays.concatenate((*parts, arrays.ones_like(x[..., :1])), -1)
+
+    @cached_property
+    def _indices(self) -> tuple[Array, ...]:
+        """Known signals that act on the plant, `nominal`, and the bounded outputs and inputs."""
+        of_y, of_u = map(np.flatnonzero, self.bounded)
+        return self.plant.E.any(0).astype(float), self.nominal, of_y, of_u
+
     def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
         """Return rows D with lower and upper bounds, and the place of the signal of each.
 

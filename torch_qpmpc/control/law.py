@@ -150,7 +150,6 @@ class Law:
         e = np.zeros(len(self.observer.F)) if memory.e is None else memory.e
         return e[: len(self.design.plant.A)], e[len(self.design.plant.A) :]
 
-    @torch.no_grad()
     def step(self, memory: Memory, y: Array, r: Array, known: Array) -> Move:
         """Return the input for the `Signals` of a step: the last one if there is no plan.
 
@@ -159,29 +158,31 @@ class Law:
         design, (memory, e, status) = self.design, self._seen(memory, y, known)
         if valid := self._are_plausible(r, 0).all():
             memory = memory._replace(r=r)
-        u = self._within(memory.u, memory)
-        held = self._after(memory, e, u)
         if e is None or status == Outcome.INVALID or not valid:
-            return Move(u, held, Outcome.INVALID)
-        x, w = np.split(e, [len(design.plant.A)])
-        mpc, level = self.mpc, known.mean(0)
+            return self._held(memory, e, Outcome.INVALID)
+        n, mpc, level = len(design.plant.A), self.mpc, known.mean(0)
         previewed, aimed = design.references == "preview", []
         for row in r if previewed else r[:1]:
-            if (target := self._aimed(row, w, level)) is None:
-                return Move(u, held, Outcome.INFEASIBLE)
-            aimed.append(target)
-        target = Target(*map(torch.stack, zip(*aimed, strict=True))) if previewed else aimed[0]
-        p = mpc.arrange(x, target, u_last=memory.u, known=known, level=level)
-        plan = self.plans.solve(p.numpy()[None])
+            if (steady := self._aimed(row, e[n:], level)) is None:
+                return self._held(memory, e, Outcome.INFEASIBLE)
+            aimed.append(steady)
+        steady = [*map(np.stack, zip(*aimed, strict=True))] if previewed else aimed[0]
+        p = design.arranged(np, e[:n], steady, memory.u, known, level)
+        plan = self.plans.solve(p[None])
         if plan.status[0]:
             proved = plan.status[0] == Status.INFEASIBLE
-            return Move(u, held, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
-        u = aimed[-1].u.numpy() + plan.z[0, mpc.n_p : mpc.n_p + mpc.n_u]
-        u = self._within(u, memory)
-        return Move(u, self._after(memory, e, u), status, target, p)
+            return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
+        u = self._within(aimed[-1][1] + plan.z[0, mpc.n_p : mpc.n_p + mpc.n_u], memory)
+        target = Target(*map(torch.from_numpy, steady))
+        return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p))
 
-    def _aimed(self, r: Array, w: Array, level: Array) -> Target | None:
-        """Return `LinearMPC.target` of one set-point; None if a QP has no solution."""
+    def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
+        """Return the move of a step without a plan: the last input, within its bounds."""
+        u = self._within(memory.u, memory)
+        return Move(u, self._after(memory, e, u), status)
+
+    def _aimed(self, r: Array, w: Array, level: Array) -> list[Array] | None:
+        """Return x, u and y of `LinearMPC.target` of a set-point; None if a QP has no solution."""
         loads, v, known = np.concatenate((w, level - self.design.nominal, [1.0])), np.zeros(0), r
         for aims in self.aims:
             state = np.concatenate((known, loads))
@@ -191,7 +192,7 @@ class Law:
             known = solution.z[0, len(state) : -len(state)]
             v = np.concatenate((v, known))
         maps = self.design.steady.maps
-        return Target(*(torch.from_numpy(Z @ v + M @ loads) for Z, M in maps))
+        return [Z @ v + M @ loads for Z, M in maps]
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.
@@ -239,10 +240,10 @@ class Law:
 
     def _within(self, u: Array, memory: Memory) -> Array:
         """Return inputs within their bounds, as known signals have them now."""
-        bounds = self.design.u_bounds
-        return np.clip(
-            u, *(bounds if memory.known is None else self.design.bounds_at(memory.known)[1])
-        )
+        lower, upper = self.design.u_bounds
+        if memory.known is not None and self.design.limits:
+            lower, upper = self.design.bounds_at(memory.known)[1]
+        return np.minimum(np.maximum(u, lower), upper)
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""

@@ -290,39 +290,28 @@ class LinearMPC(Affine):
         Raises:
             QPError: a name or a shape is wrong.
         """
-        places, n_d = self.design.places, self.n_d
         if unknown := sorted(signals.keys() - {"u_last", "known", "level"}):
             raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known, level")
-        x = torch.as_tensor(x, dtype=torch.float64)
-        values = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in signals.items()}
-        level = values.pop("level", x.new_zeros(()))
-        if "known" in values and values["known"].shape[-1] == self.design.plant.sizes[3]:
-            loads = torch.from_numpy(self.design.plant.E.any(0))
-            rest = level * loads + torch.from_numpy(self.design.nominal)
-            values["known"] = values["known"] - rest.unsqueeze(-2)
-        base = target
-        if self.design.references == "preview":
-            base = Target(*(part[..., -1, :] for part in target))
-            values |= {
-                "r": target.y - target.y[..., -1:, :],
-                "u_r": target.u - target.u[..., -1:, :],
-            }
-        values |= {"x": x - base.x, "u_last": values.get("u_last", base.u) - base.u}
-        y, u = (torch.from_numpy(mask) for mask in self.design.bounded)
-        values |= {"y_s": base.y[..., y], "u_s": base.u[..., u], "one": x.new_ones(())}
-        d = x.new_zeros(*x.shape[:-1], self.horizon + 1, n_d)
-        state = x.new_zeros(*x.shape[:-1], self.n_x)
-        for name, value in values.items():
-            place = places[name]
-            if place.start == place.stop and name != "known":
-                continue
-            part = d[..., place] if place.stop <= n_d else state[..., _shifted(place, -n_d)]
+        design, (n, m, n_y, n_d) = self.design, self.design.plant.sizes
+        rows = self.horizon + 1 if design.references == "preview" else 0
+        batch = torch.as_tensor(x).shape[:-1]
+        defaults = {"u_last": target.u[..., -1, :] if rows else target.u, "level": 0.0}
+        values = {"x": x, "known": torch.from_numpy(design.nominal), **defaults, **signals}
+        shapes = {"x": (n,), "u_last": (m,), "known": (self.horizon + 1, n_d), "level": (n_d,)}
+        values |= {f"target.{name}": part for name, part in target._asdict().items()}
+        sizes = zip("xuy", (n, m, n_y), strict=True)
+        shapes |= {f"target.{name}": (rows, size)[not rows :] for name, size in sizes}
+        for name, shape in shapes.items():
+            value = torch.as_tensor(values[name], dtype=torch.float64)
             try:
-                part.copy_(value)
+                values[name] = value.expand(*batch, *shape)
             except RuntimeError as error:
-                want = f"{part.shape[-1]} entries, and batch dimensions as those of x"
+                want = f"{shape[-1]} entries, and batch dimensions as those of x"
                 raise QPError.expected(name, f"shape {tuple(value.shape)}", want) from error
-        return torch.cat((d.flatten(-2), state), -1)
+        steady = [values[f"target.{name}"] for name in "xuy"]
+        return design.arranged(
+            torch, values["x"], steady, values["u_last"], values["known"], values["level"]
+        )
 
 
 def read_wishes(
@@ -349,10 +338,6 @@ def read_wishes(
             wishes[name], own = read_limits(name, wishes[name], names, plant)
             limits = {key: pair for key, pair in limits.items() if key not in names} | own
     return {name: readers[name](name, x) for name, x in wishes.items()} | {"limits": limits}
-
-
-def _shifted(place: slice, by: int) -> slice:
-    return slice(place.start + by, place.stop + by)
 
 
 def read_stored(content: Mapping[str, Any]) -> Design:

@@ -175,14 +175,14 @@ def read_table(
     if isinstance(value, Mapping):
         if {*value} != {*names}:
             raise QPError.expected(name, f"signals {sorted(value)}", f"the signals {sorted(names)}")
-        columns = [np.atleast_1d(read_numbers(name, value[x]).detach().numpy()) for x in names]
+        columns = [np.atleast_1d(_numbers(name, value[x])) for x in names]
         try:
             table = np.stack(np.broadcast_arrays(*columns), axis=-1)
         except ValueError as error:
             lengths = [len(x) for x in columns]
             raise QPError.expected(name, f"lengths {lengths}", "columns of one length") from error
     else:
-        table = np.atleast_1d(read_numbers(name, value).detach().numpy())
+        table = np.atleast_1d(_numbers(name, value))
         table = table[None] if table.ndim == 1 else table
     if table.ndim != 2 or table.shape[1] != len(names) or not len(table):
         want = f"{len(names)} numbers ({', '.join(names)}), or rows of these"
@@ -200,12 +200,19 @@ def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> 
         if unknown := sorted({*value} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         value = [value.get(x, missing) for x in names]
-    vector = read_numbers(name, value).detach().numpy()
+    vector = _numbers(name, value)
     vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
     if vector.shape != (len(names),) or np.isnan(vector).any():
         want = f"a number, or one for each of {', '.join(names)}"
         raise QPError.expected(name, f"shape {vector.shape} or NaN", want)
     return vector
+
+
+def _numbers(name: str, value: Any) -> Array:
+    """Return `read_numbers` as an array, which numbers and arrays of float64 are at once."""
+    if isinstance(value, float) or getattr(value, "dtype", None) == np.float64:
+        return np.asarray(value)
+    return read_numbers(name, value).detach().numpy()
 
 
 def _matrix(name: str, value: Any) -> Array:
