@@ -67,14 +67,14 @@ LAYERS = {
 BUDGET = {
     ".": 435,
     "analysis": 1160,
-    "control": 4287,
+    "control": 4309,
     "envs": 1534,
     "experiment": 3927,
     "export": 1427,
     "learning": 2972,
-    "mpc": 5468,
+    "mpc": 5481,
     "proofs": 1003,
-    "qp": 5905,
+    "qp": 5909,
     "study": 613,
 }
 #: Libraries that only some layers may import.

@@ -214,3 +214,19 @@ def test_its_solves_are_counted():
             mpc.predict(STATES[0])
     assert (log.solves, log.recalled, log.unsolved, log.fallback) == (5, 5, 0, 0)
     assert 0 < log.residual < 1e-6
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_policy_without_gradients_is_as_fast_and_forgets_earlier_states(dtype):
+    mpc, s = random_mpc(6), STATES.to(dtype)
+    batch = mpc.policy(s).detach()
+    with torch.no_grad(), SolveLog() as log:
+        first = [mpc.policy(x) for x in s]
+        again = [mpc.policy(x) for x in reversed(s)]
+        assert mpc.policy(s[:1]).shape == (1, mpc.n_u)
+    assert log.solves == 2 * len(s) + 1
+    assert log.recalled > 0.5 * log.solves
+    assert torch.equal(torch.stack(first), torch.stack(again[::-1])), "as a resumed run needs it"
+    assert_close(torch.stack(first), batch, atol=1e-6, rtol=1e-5)
+    assert first[0].dtype == dtype
+    assert mpc.policy(s[0]).requires_grad

@@ -50,7 +50,7 @@ from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
-from torch_qpmpc.qp.tracing import serially_if_forked
+from torch_qpmpc.qp.tracing import is_differentiating, is_eager, serially_if_forked
 
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")
@@ -335,6 +335,11 @@ class QPMPC(nn.Module):
 
         ``warm_start``, ``qp`` and errors are as in `solve`.
         """
+        plain = qp is None and warm_start is None and s.dtype in (torch.float32, torch.float64)
+        if plain and s.numel() == self.n_p and is_eager((s,)) and not is_differentiating():
+            u = self._action_at_rest(self._checked(s).cpu().numpy(), warm=False)
+            if u is not None:
+                return torch.from_numpy(u).to(s.device)
         return self._action(self.solve(s, warm_start=warm_start, qp=qp), s.dtype)
 
     @without_gradients
@@ -370,11 +375,8 @@ class QPMPC(nn.Module):
             check_tensor("observation", torch.as_tensor(x), self.n_p)
         if not np.isfinite(x).all():
             raise QPError.expected("observation", "NaN or inf", "finite numbers")
-        if x.size == self.n_p and (at_rest := self._solver_at_rest()) is not None:
-            solution = at_rest.solve(x.reshape(1, -1).astype(np.float64))
-            if not solution.status[0]:  # else the other way raises its error
-                u = solution.z[0, self.n_p : self.n_p + self.n_u]
-                return u.reshape(*x.shape[:-1], self.n_u).astype(x.dtype)
+        if x.size == self.n_p and (u := self._action_at_rest(x, warm=True)) is not None:
+            return u
         s = torch.as_tensor(x).to(self.C_0.device)
         return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
 
@@ -717,6 +719,17 @@ class QPMPC(nn.Module):
     def at_rest(self) -> AtRest:
         """Return what solves V's QPs with today's theta, without the schedule, one by one."""
         return AtRest(self.quadratic_program(), self.n_p, self.n_p + self.n_u, self.solver)
+
+    def _action_at_rest(self, x: np.ndarray, warm: bool) -> np.ndarray | None:
+        """Return pi of one state, from the last active set or none; None if the QP is not solved.
+
+        From none, it does not depend on earlier calls, so that a resumed run repeats it.
+        """
+        if (at_rest := self._solver_at_rest()) is None:
+            return None
+        solution = at_rest.solve(x.reshape(1, -1).astype(np.float64), warm)
+        u = solution.z[0, self.n_p : self.n_p + self.n_u]
+        return None if solution.status[0] else u.reshape(*x.shape[:-1], -1).astype(x.dtype)
 
     def _solver_at_rest(self) -> AtRest | None:
         """Return `at_rest` until theta changes; None if that cannot be seen."""

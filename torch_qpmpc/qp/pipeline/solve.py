@@ -184,7 +184,7 @@ def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None
 
 
 class AtRest:
-    """QPs of a theta at rest, solved one after the other, each from the last one's active set.
+    """QPs of a theta at rest, solved one after the other.
 
     What that does not solve, or the certificate rejects, is solved as any other QP.
 
@@ -205,8 +205,12 @@ class AtRest:
         # The certificate proves nothing without a convex cost.
         self._is_sound = programs.scaled().solvable() is None
 
-    def solve(self, fixed: np.ndarray) -> BatchSolution:
-        """Solve and certify the QP with the fixed entries ``(1, n_f)``, in float64."""
+    def solve(self, fixed: np.ndarray, warm: bool = True) -> BatchSolution:
+        """Solve and certify the QP with the fixed entries ``(1, n_f)``, in float64.
+
+        It starts from the last active set if it is ``warm``, else from the empty one.
+        """
+        self._active = self._active if warm else np.zeros_like(self._active)
         began, programs, log = time.perf_counter(), self._of(fixed), _active_log.get(None)
         if (solution := self._recalled(programs)) is None:
             solution = solve_programs(programs, self.solver)
