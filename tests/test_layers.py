@@ -74,7 +74,7 @@ BUDGET = {
     "learning": 2972,
     "mpc": 5481,
     "proofs": 1003,
-    "qp": 5909,
+    "qp": 5934,
     "study": 613,
 }
 #: Libraries that only some layers may import.

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -191,3 +192,30 @@ def test_finite_sizes_are_the_largest_of_the_qps_that_share_a_matrix():
     np.testing.assert_array_equal(
         linalg.finite_sizes(vectors[2:], np.zeros(9, int), 2), [[2, 5]] * 2
     )
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_first_compilation_is_shown_on_a_terminal(monkeypatch):
+    def own(x):
+        return x + 1
+
+    def other(x):
+        return x + 2
+
+    own.__module__ = "torch_qpmpc.qp.kernels"
+    shown = []
+    for function in (own, other):
+        kernel = numba.njit(function)
+        terminal = Terminal()
+        monkeypatch.setattr(sys, "stderr", terminal)
+        assert kernel(1) == function(1)
+        shown.append(terminal.getvalue())
+        assert kernel(2) == function(2)
+        assert terminal.getvalue() == shown[-1], "nothing is compiled twice"
+    assert "compiling for this processor, once" in shown[0]
+    assert "own" in shown[0]
+    assert not shown[1], "a user's own function is not ours to announce"

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import config
+from numba.core.event import Event, Listener, register
 from numba.extending import intrinsic
 
 from torch_qpmpc.errors import QPError
@@ -34,6 +35,30 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
         return numba.njit(cache=True, error_model="numpy", **options)(function)
     except RuntimeError:
         return numba.njit(error_model="numpy", **options)(function)
+
+
+class Progress(Listener):
+    """A line on a terminal while kernels are compiled, once on each machine."""
+
+    def __init__(self) -> None:
+        self._bars: list[Any] = []
+
+    def on_start(self, event: Event) -> None:
+        from tqdm import tqdm  # most processes load what is compiled
+
+        data, text = event.data or {}, "compiling for this processor, once"
+        kernel = data["dispatcher"].py_func
+        own = kernel.__module__.startswith("torch_qpmpc") and not self._bars
+        hidden = None if own else True  # None: without a terminal
+        self._bars.append(tqdm(desc=text, unit=" kernels", leave=False, disable=hidden))
+        self._bars[0].set_postfix_str(kernel.__name__)
+
+    def on_end(self, event: Event) -> None:
+        self._bars[0].update()
+        self._bars.pop().close()
+
+
+register("numba:compile", Progress())
 
 
 # LLVM vectorises loops whose sums may be reordered, or whose entries are never NaN.
