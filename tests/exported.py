@@ -144,7 +144,7 @@ def draw_known(mpc: Any, count: int, seed: int = 0) -> np.ndarray:
 
 
 def load(
-    mpc: Any, folder: Path, flags: tuple[str, ...] = ("-O1",), **settings: Any
+    mpc: Any, folder: Path, flags: tuple[str, ...] = ("-O0",), **settings: Any
 ) -> tuple[Library, Tables]:
     """Write and compile the tables of a QP, without a comparison."""
     tables = make_tables(mpc)

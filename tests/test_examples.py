@@ -16,7 +16,7 @@ from torch_qpmpc.experiment.tasks import TASKS
 
 SHORT = (
     *("updates=2", "eval_interval=2", "log_interval=1", "warmup_steps=10", "batch_size=16"),
-    *("task.eval_steps=3", "rivals=true", "replay_capacity=8000"),
+    *("task.eval_steps=3", "rivals=true", "replay_capacity=8000", "gate=false"),
 )
 #: Not scripts that register no task.
 NAMES = sorted(x.stem for x in FOLDER.glob("*.py") if "register(" in x.read_text("utf-8"))

@@ -46,6 +46,7 @@ qp, fixed = KNOWN.qp, KNOWN.fixed
 GOOD = dict(zip(("H", "q", "c", "C", "b", "G", "lb", "ub", "w"), qp.tensors(), strict=True))
 mpc, free = random_mpc(0), qm.GaussNewton(random_mpc(0, learn=("H", "c", "C")))
 S, Aa, V = zeros(4, 2), zeros(4, 1), zeros(4)
+WEIGHTS = tensor([1.0, nan, 1.0])
 TD = partial(TensorDict, batch_size=4)
 op, gn = make_operator(), qm.GaussNewton(random_mpc(0))
 deviation, si = qm.DeviationPenalty(mpc.C_0, 2, 1), qm.SystemIdentificationPenalty()
@@ -169,6 +170,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("('next', 'terminated'): got torch.float32", with_entry(("next", "terminated"), zeros(3, 1))),
     ("('next', 'terminated'): got shape (3,)", with_entry(("next", "terminated"), zeros(3).bool())),
     ("a: got torch.int64, expected a floating-point", with_entry("action", zeros(3, 1).long())),
+    ("priority_weight: got NaN or inf, expected finite", with_entry("priority_weight", WEIGHTS)),
     ("tensordict: got an empty batch, expected at least", lambda: make_loss()(make_batch(3)[:0])),
     ("mpc: got QPActorValueOperator, expected a QPMPC. Pass the QPMPC", lambda: qm.GaussNewton(op)),
     ("rates: got list, expected a mapping such as {'cost': .., 'constraints':", G(scales=[1.0])),

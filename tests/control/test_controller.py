@@ -75,13 +75,6 @@ def test_signals_go_in_and_out_by_name():
     assert u == {"valve": by_vector.step([0.5], [1.0])[0]}
 
 
-def test_a_controller_shows_its_design_and_last_input():
-    controller = qm.Controller(integrator(inputs=["valve"], outputs=["level"]))
-    text = "level by valve; horizon 20; Q [1.0]; R [0.1]; dR [0.1]"
-    assert repr(controller) == f"Controller({text}; u = [0.0])"
-    assert text in repr(controller.mpc)
-
-
 def test_a_reset_starts_where_the_plant_rests():
     controller = qm.Controller(integrator())
     controller.reset(y=[3.0], u=[0.2])
@@ -197,7 +190,7 @@ def test_a_mode_that_no_input_moves_has_no_filter():
 
 
 @pytest.mark.parametrize("references", ["held", "preview"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_step_is_that_of_the_differentiable_parts(seed, references):
     """Noise, loads and set-points out of reach: target, plan and input of each step."""
     rng, A, known = np.random.default_rng(seed), np.diag([0.9, 0.7, 0.5]), {}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
-import sys
 
 import gymnasium
 import numpy as np
@@ -83,15 +81,6 @@ def test_starts_off_rest_change_no_decision(model, accepted):
     report = controller.learn(Lag(start=3.0), **QUICK)
     assert report.accepted == accepted
     assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
-
-
-def test_a_bar_shows_the_progress_on_a_terminal_alone(monkeypatch):
-    for interactive in (True, False):
-        monkeypatch.setattr(sys, "stderr", written := io.StringIO())
-        monkeypatch.setattr(written, "isatty", lambda shown=interactive: shown)
-        made(RIGHT).learn(Lag(), **{**QUICK, "steps": 2, "transitions": 8})
-        text = written.getvalue()
-        assert all((word in text) == interactive for word in ("transitions: ", "comparison: "))
 
 
 def test_a_controller_with_the_true_model_stays_as_it_is():

@@ -89,7 +89,7 @@ def test_the_plan_is_that_of_the_problem_in_the_docstring(references, blocks, he
     options = {**NAMES, **wide, "references": references, "blocks": blocks}
     mpc = qm.LinearMPC((A, B, C), 8, E=E, **options)
     rng = np.random.default_rng(0)
-    for _ in range(4):
+    for _ in range(2):
         x, w, u_last = rng.normal(size=3), 0.1 * rng.normal(size=2), rng.uniform(-0.8, 0.8, 2)
         r = 0.1 * rng.normal(size=(9, 2))
         r = r if references == "preview" else r[:1].repeat(9, 0)

@@ -71,23 +71,6 @@ def test_wrong_model():
     assert A.dtype == B.dtype == torch.float64
 
 
-def test_gymnasium_environment_draws_one_number_a_step_and_none_at_a_reset():
-    env, rng = GrosZanonLTIGymEnv(), np.random.default_rng(5)
-    A, B = np.array([[0.9, 0.35], [0, 1.1]]), np.array([0.0813, 0.2])
-    actions = np.random.default_rng(6).uniform(-1, 1, 10).astype(np.float32)
-    for seed in (5, None):
-        observation, _ = env.reset(seed=seed)
-        s = np.array([0, 0.15])
-        np.testing.assert_array_equal(observation, s.astype(np.float32))
-        for action in actions:
-            observation, reward, *_ = env.step(action[None])
-            outside = np.maximum([0, -1] - s, 0) + np.maximum(s - 1, 0)
-            cost = (s @ s + 0.5 * np.float64(action) ** 2 + 100 * outside.sum()) / 2
-            assert reward == pytest.approx(-cost, abs=1e-12)
-            s = A @ s + B * action + [rng.uniform(-0.1, 0.0), 0]
-            np.testing.assert_allclose(observation, s, atol=1e-6)
-
-
 def test_the_true_model_has_the_mean_of_the_noise():
     plant = GrosZanonLTI()
     A, B, offset = plant.true_model()

@@ -38,10 +38,9 @@ def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
     return ENVS[request.param]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_torchrl_accepts_the_specs(make, dtype):
-    check_env_specs(make(3, 5, dtype=dtype, seed=0), seed=0)
-    check_env_specs(SerialEnv(2, lambda: make(3, 5, dtype=dtype)), seed=0)
+def test_torchrl_accepts_the_specs(make):
+    check_env_specs(make(3, 5, dtype=torch.float64, seed=0), seed=0)
+    check_env_specs(SerialEnv(2, lambda: make(3, 5, dtype=torch.float32)), seed=0)
 
 
 def test_rollouts_depend_on_the_seed_only(make):

@@ -65,7 +65,7 @@ class Lag(gymnasium.Env):
 
 
 DATA = (*SMALL, "start=data", "start.transitions=400", "task=gymnasium", "task.id=Lag-v0")
-DATA += ("noise=none", "task.start_episodes=4")
+DATA += ("noise=none", "task.start_episodes=2")
 BOUNDED = "task.observation_bounds=true"
 #: Zero action is best: the input does next to nothing and is expensive.
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
@@ -246,13 +246,15 @@ def test_the_gate_copies_a_held_action_into_the_scheme_that_learning_begins_with
     assert scheme.policy(torch.ones(1, physics.n_x, dtype=torch.float64)).abs() < 1e-12
 
 
-def trained_and_resumed(cfg, folder, monkeypatch) -> FinishedRun:
-    """Train; the files have the policies evaluated, and a run that was cut ends likewise."""
+def trained_and_resumed(cfg, folder, monkeypatch=None) -> FinishedRun:
+    """Train; the files have the policies evaluated, and a run that is cut ends likewise."""
     whole, cut = folder / "whole", folder / "cut"
     summary, run = train.train(cfg, str(whole), quiet=True), FinishedRun(whole)
     for name, policy in (("J_start", run.start), ("J_best", run.policy)):
         J = evaluate(cfg, warm_policy(policy), run.physics).J
         assert summary[name] == pytest.approx(J, rel=1e-9)
+    if monkeypatch is None:
+        return run
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     run_command(f"resume={cut}")
     assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
@@ -273,10 +275,9 @@ def turning(monkeypatch):
 
 
 @pytest.mark.usefixtures("turning")
-def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path, monkeypatch):
+def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path):
     settings = ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2")
-    cfg = make_config(*DATA, "task.start_episodes=2", *settings)
-    run = trained_and_resumed(cfg, tmp_path, monkeypatch)
+    run = trained_and_resumed(make_config(*DATA, *settings), tmp_path)
     assert run.summary["start"].startswith(BLENDED)
     assert run.policy.schedule is not None
     assert run.start.schedule is not None

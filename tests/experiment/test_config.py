@@ -66,6 +66,7 @@ class Recorder:
 
 
 DATA = ("start=data", "task=pendulum", "start.transitions=40", "constraint=free")
+LOOPS = ("optimizer=closed_loop", "optimizer.loops=2", "optimizer.steps=2", "optimizer.members=1")
 
 
 def test_each_key_is_read(tmp_path, monkeypatch):
@@ -77,7 +78,7 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "first": ("gate=true", "optimizer=adam"),
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton"),
         "data": (*DATA, "+task.start_episodes=2"),
-        "loops": (*DATA, "optimizer=closed_loop"),
+        "loops": (*DATA, *LOOPS),
     }.items():
         cfg = make_config(
             *SMALL, "updates=2", "task.eval_steps=2", "task.episode_steps=4", *overrides

@@ -98,7 +98,7 @@ def test_on_the_plant_no_two_episodes_are_the_same_and_all_count(gate, name):
 def test_a_gate_that_only_keeps_does_not_change_what_is_learned(tmp_path):
     ends = {}
     for gate in ("true", "false", "act"):
-        cfg = make_config(*GATED, "updates=8", "gate_interval=1", f"gate={gate}")
+        cfg = make_config(*GATED, "updates=4", "gate_interval=1", f"gate={gate}")
         ends[gate] = train.train(cfg, str(tmp_path / gate))
     assert ends["true"]["rejected"] > 0
     assert ends["true"]["J_final"] == ends["false"]["J_final"]

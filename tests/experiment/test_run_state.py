@@ -31,14 +31,11 @@ DATA = ("start=data", "start.transitions=200", "constraint=free")
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("optimizer=sgd", "constraint=combined", "solver=torch", "step=projection"),
-        (SECOND, "constraint=combined", "solver=proxqp"),
-        ("optimizer=adam", "constraint=mpc", "release=7"),
+        ("optimizer=adam", "constraint=mpc", "release=7", "solver=torch", "step=projection"),
         (SECOND, "constraint=free", "replay=false", "noise=brownian", "steps_per_update=3"),
-        (SECOND, "gate=plant", "constraint=mpc", "release=3"),
-        (SECOND, "gate=true", *DATA),
+        (SECOND, "gate=plant", "constraint=mpc", "release=3", "solver=proxqp"),
         (*LOOPS, "gate=true", *DATA),
-        (SECOND, "task=store", "constraint=si", "replay_capacity=40"),
+        (SECOND, "task=store", "constraint=combined", "replay_capacity=40"),
     ],
     ids=" ".join,
 )

@@ -20,7 +20,6 @@ from torch_qpmpc.experiment.sweeps import (
     SweepProgress,
     finished_run,
     number_of_runs,
-    stopped_run,
     sub_folder,
 )
 
@@ -133,10 +132,6 @@ def finished(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_finished_run_is_recognised_by_its_settings(finished):
-    assert finished_run(finished, make_config(*SMALL)) == OUTCOME
-
-
 @pytest.mark.parametrize(
     ("override", "difference"),
     [
@@ -147,15 +142,6 @@ def test_a_finished_run_is_recognised_by_its_settings(finished):
 def test_other_settings_are_another_run(finished, override, difference):
     with pytest.raises(QPError, match=f"a finished run with .*{difference}.*hydra.sweep.dir"):
         finished_run(finished, make_config(*SMALL, override))
-
-
-def test_a_run_that_was_stopped_has_not_finished(finished):
-    (finished / "summary.json").unlink()
-    (finished / "tensorboard").mkdir()
-    assert finished_run(finished, make_config(*SMALL)) is None
-    assert stopped_run(finished, make_config(*SMALL)) is None
-    assert not (finished / "tensorboard").exists()
-    assert (finished / "config.yaml").exists()
 
 
 # --- Progress ------------------------------------------------------------------------------------

@@ -147,6 +147,7 @@ def test_the_true_scheme_has_the_mean_of_the_noise():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
+        (("task.A=null",), r"^task\.A: got null, expected the rows of a matrix \(3, 3\)"),
         (
             ("task.id=MountainCarContinuous-v0",),
             r", expected task\.A of shape \(2, 2\), ",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -50,7 +49,7 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 WHOLE = (
     *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
-    *("updates=90", "eval_interval=35", "gate=false", "rivals=false"),
+    *("updates=50", "eval_interval=35", "gate=false", "rivals=false"),
 )
 
 
@@ -76,16 +75,16 @@ def test_folder_is_complete(whole):
     folder, summary = whole
     assert summary == json.loads((folder / "summary.json").read_text())
     names = {"step": "cholesky", "seed": 5, "constraint": "combined", "noise": "gaussian"}
-    assert {**summary, **names, "solver": "daqp", "updates": 90, "ablation": None} == summary
+    assert {**summary, **names, "solver": "daqp", "updates": 50, "ablation": None} == summary
     assert 0 < summary["train_seconds"] < 600
     assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
     assert (folder / "summary.png").exists()
     assert (folder / "episode.png").exists()
     table = metrics(folder)
-    assert sorted(table.index) == sorted({*range(0, 91, 10), 35})
+    assert sorted(table.index) == sorted({*range(0, 51, 10), 35})
     J = table["eval/J"].dropna()
-    assert list(J.index) == [0, 35, 70, 90]
-    assert (J[0], J[90]) == (summary["J_start"], summary["J_final"])
+    assert list(J.index) == [0, 35, 50]
+    assert (J[0], J[50]) == (summary["J_start"], summary["J_final"])
     columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "qp/solves", "time/qp"]
     assert np.isfinite(table.drop(index=[0, 35])[columns]).all(axis=None)
     assert table["qp/residual"].max() < 1e-6
@@ -332,21 +331,6 @@ def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
     assert (summary["task"], summary["unsolved"]) == ("gymnasium", 0)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ((), r"^task.id: got '\?\?\?', expected the id of a Gymnasium env.* task.id=Pendulum-v1"),
-        (("task.id=Pendulum-v9",), "^task.id: got 'Pendulum-v9', expected an environment that Gym"),
-        (("task.id=CartPole-v1",), r"^task.id: got 'CartPole-v1', whose action space is Discrete"),
-        (("task.id=Pendulum-v1",), r"^task.A: got null, expected the rows of a matrix \(3, 3\)"),
-    ],
-)
-def test_missing_keys_of_a_gymnasium_task_are_named(tmp_path, monkeypatch, overrides, message):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match=message):
-        run_command("task=gymnasium", *overrides, *SHORT)
-
-
 class Faulty(PointMassGymEnv):
     """A point mass that raises, or has rewards of NaN, in a share of its steps."""
 
@@ -365,14 +349,14 @@ class Faulty(PointMassGymEnv):
 
 
 @pytest.mark.filterwarnings("ignore:The plant ends", "ignore:.*rewards are NaN", "ignore:Two epi")
-@pytest.mark.parametrize("start", ["model", "data"])
 @pytest.mark.parametrize(
-    ("share", "raises", "after", "wrong"),
+    ("start", "share", "raises", "after", "wrong"),
     [
-        (0.01, True, 0, None),
-        (1.0, True, 0, "The plant ends episodes by ArithmeticError: the integrator failed"),
-        (1.0, False, 0, "Return a number from the environment's step, or end the episode."),
-        (0.5, False, 3, "Return a number from the environment's step, or end the episode."),
+        ("data", 0.01, True, 0, None),
+        ("model", 1.0, True, 0, "The plant ends episodes by ArithmeticError: the integrator fail"),
+        ("data", 1.0, False, 0, None),
+        ("model", 1.0, False, 0, "Return a number from the environment's step, or end the episode"),
+        ("data", 0.5, False, 3, "Return a number from the environment's step, or end the episode"),
     ],
 )
 def test_a_faulty_plant_is_reported(
@@ -389,7 +373,7 @@ def test_a_faulty_plant_is_reported(
     options = f"task.kwargs={{share: {share}, raises: {raises}, after: {after}}}"
     arguments = ("task=gymnasium", "task.id=Faulty-v0", options, *model, *SHORT, "figures=false")
     arguments += ("task.episode_steps=20", "hydra.run.dir=run")
-    if wrong is None:
+    if raises and wrong is None:
         run_command(*arguments)
         summary = json.loads((tmp_path / "run" / "summary.json").read_text())
         assert summary["raised"] > 0
@@ -403,14 +387,3 @@ def test_a_faulty_plant_is_reported(
         assert "reward: got NaN in " in str(error.value)
         assert wrong in str(error.value)
     assert (tmp_path / "run" / "summary.json").exists() == bool(after)
-
-
-@pytest.mark.parametrize(("terminal", "quiet"), [(True, False), (True, True), (False, False)])
-def test_a_bar_names_the_first_evaluation(tmp_path, capsys, monkeypatch, terminal, quiet):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    cfg = make_config(*TINY, "updates=2")
-    train.train(cfg, str(tmp_path), quiet=quiet)
-    shown = capsys.readouterr().err
-    for line in ("first evaluation:", "start", "true model"):
-        assert (line in shown) is (terminal and not quiet), line
-    assert ("2/2" in shown) is not quiet

@@ -24,7 +24,7 @@ RATES = {
 }
 
 
-@pytest.mark.parametrize(("optimizer", "slack"), [*zip(RATES, ["100", "inf", "inf"], strict=True)])
+@pytest.mark.parametrize(("optimizer", "slack"), [*zip(RATES, ["100", "100", "inf"], strict=True)])
 def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer, slack):
     sizes = ("updates=5", "eval_interval=5", "task.eval_steps=5", f"task.state_slack={slack}")
     rates = (f"optimizer={optimizer}", *RATES[optimizer], "optimizer.final_fraction=1")

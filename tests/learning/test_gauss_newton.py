@@ -241,19 +241,6 @@ def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
     assert not optimizer.state
 
 
-def test_a_report_is_shown_without_tensors():
-    mpc = random_mpc(15, on_failure="mask")
-    (s, a), target = pairs(), targets(mpc)
-    a[1], target[3] = 9.0, torch.nan
-    text = repr(GaussNewton(mpc).step(s, a, target))
-    assert text.startswith("StepReport(damping=0.03, ratio=")
-    assert "accepted=True, unsolved=1, without_target=1, solution=QPSolution(" in text
-    assert "solved 6 of 7, 1 INFEASIBLE" in text
-    assert "tensor" not in text
-    assert len(text.splitlines()) < 10
-    assert len(text) < 800
-
-
 @pytest.mark.parametrize("trust_region", [False, True])
 def test_residuals_are_rows_of_the_least_squares_problem(trust_region):
     """1/2 v |r + dr/dq dq|^2 joins the batch, with v the mean squared TD error."""

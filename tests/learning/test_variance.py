@@ -99,14 +99,6 @@ def test_weighted_q_learning_finds_the_optimal_gain_under_actuator_noise():
     assert plain > 2 * weighted
 
 
-def test_the_weights_have_no_units():
-    p, a, value, use = pairs()
-    error = a[:, 0] * normal(COUNT, seed=3)
-    weight = inverse_variance(p, a, value, error, use)
-    scaled = inverse_variance(10 * p + 3, 7 * a, 2 * value, 100 * error, use)
-    assert_close(scaled, weight, rtol=1e-6, atol=0)
-
-
 def test_equal_inputs_leave_the_weights_finite():
     p, a, value, use = (x[:50] for x in pairs())
     weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)

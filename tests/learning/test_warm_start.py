@@ -71,13 +71,6 @@ def test_the_loss_keeps_the_active_sets_of_both_problems(solver, delay_value):
         assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
-def test_without_a_key_nothing_is_written():
-    td = transitions()
-    make_loss(None)(td)
-    assert ACTIVE_SET not in td
-    assert ACTIVE_SET not in td["next"]
-
-
 def test_a_replay_returns_remembered_active_sets():
     replay = Replay(8 * 4, 4, 6, 2, 5, active_rows=3)
     batch = transitions(20).reshape(4, 5)
@@ -99,14 +92,6 @@ def test_a_replay_returns_remembered_active_sets():
     assert len(told) == 20
     replay.extend(batch)
     assert (replay.transitions[:][ACTIVE_SET] == UNKNOWN).any()
-
-
-def test_a_replay_without_active_sets_has_nothing_to_remember():
-    replay = Replay(32, 4, 6, 2, 5)
-    replay.extend(transitions(20).reshape(4, 5))
-    sample = replay.sample()
-    assert ACTIVE_SET not in sample
-    replay.remember(sample)
 
 
 def test_training_is_the_same_without_the_cache(tmp_path, monkeypatch):

@@ -276,11 +276,3 @@ def test_errors_that_cannot_be_squared_move_nothing():
     before = mpc.C.detach().clone()
     assert not GaussNewton(mpc).step(s, a, 1e160 * target).accepted
     assert torch.equal(mpc.C, before)
-
-
-def test_weights_that_are_not_finite_are_named():
-    loss = QPQLearningLoss(QPActorValueOperator(random_mpc(0, action_slack=10.0)))
-    loss.make_value_estimator(gamma=0.9)
-    batch = make_batch(4).set("priority_weight", torch.tensor([1.0, torch.nan, 1.0, 1.0]))
-    with pytest.raises(QPError, match="priority_weight: got NaN or inf, expected finite weights"):
-        loss(batch)

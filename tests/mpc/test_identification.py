@@ -77,7 +77,7 @@ def test_the_report_is_printed():
 
 
 def test_errors_are_those_of_data_that_the_fit_has_not_seen():
-    found = qm.identify(lag_log(noise=0.2, steps=600), N)
+    found = qm.identify(lag_log(noise=0.2, steps=400), N)
     assert found.errors.shape[1:] == (N, 2)
     assert_close(found.rmse[0], torch.full((2,), 0.2).double(), rtol=0.15, atol=0)
     assert_close(torch.tensor(found.model.S), 0.04 * torch.eye(2).double(), rtol=0, atol=0.01)
@@ -85,7 +85,7 @@ def test_errors_are_those_of_data_that_the_fit_has_not_seen():
 
 
 def test_a_collinear_output_leaves_the_predictions_as_good():
-    log = lag_log(noise=0.2, steps=300)
+    log = lag_log(noise=0.2, steps=200)
     twice: Any = log.clone()
     for steps in (twice, twice["next"]):
         y = steps["observation"]

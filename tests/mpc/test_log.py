@@ -78,7 +78,7 @@ def test_arrays_and_columns_have_names_by_default():
 def test_steps_of_torchrl_get_names():
     log = qm.read_log(arx_log(), ["T", "p"], ["q"], ["w"])
     assert str(log) == "120 steps: outputs T, p; inputs q; known w"
-    assert qm.identify(log, 4).log is log
+    assert qm.identify(log, 4, order=0).log is log
     with pytest.raises(QPError, match=r"^inputs: got \['q', 'v'\], expected 1 names"):
         qm.read_log(arx_log(), ["T", "p"], ["q", "v"])
     with pytest.raises(QPError, match=r"^time, episode: got 't' and None, expected None for a"):
@@ -134,7 +134,7 @@ def test_a_signal_may_have_any_name(names):
     y, u = rng.normal(size=(30, 2)), rng.normal(size=30)
     log = qm.read_log({names[0]: y[:, 0], names[1]: y[:, 1], "u": u, "t": u}, names, ["u"])
     assert (log.outputs, log.inputs, log.known) == (tuple(names), ("u",), ())
-    assert qm.LinearMPC(qm.identify(log, 2), 3, Q=1.0).horizon == 3
+    assert qm.LinearMPC(qm.identify(log, 2, order=0), 3, Q=1.0).horizon == 3
     assert qm.read_log({"y": u, "u": u**2, "d": np.arange(30)}, time="d").known == ()
 
 

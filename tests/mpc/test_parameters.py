@@ -41,10 +41,9 @@ def assert_predicted(mpc: QPMPC, s: Tensor = STATES, near: float = 1e-9) -> None
     assert exact.mean() > 0.5
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", SETTINGS)
-def test_one_state_has_the_action_of_a_batch(name, seed):
-    mpc = made(name, seed)
+def test_one_state_has_the_action_of_a_batch(name):
+    mpc = made(name, 1)
     s, _ = inputs(mpc, 12)
     # Multipliers within their tolerance of 1e-9 move the action more where there is no curvature.
     assert_predicted(mpc, s.detach(), 1e-6 if name in PREVIEWED else 1e-9)

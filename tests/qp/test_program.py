@@ -139,14 +139,6 @@ def test_every_status_explains_itself(status):
     assert len(status.explanation) > 20
 
 
-def test_a_program_is_shown_by_its_sizes():
-    expected = (
-        "QuadraticProgram(batch_shape=(5,), n_z=12, n_c=3, n_g=13, dtype=torch.float64, "
-        "device='cpu')"
-    )
-    assert repr(known_qp(0, batch=(5,)).qp) == expected
-
-
 def test_a_solution_is_shown_by_its_outcome():
     known = known_qp(0, batch=(5,))
     fixed = known.fixed.clone()
@@ -159,12 +151,3 @@ def test_a_solution_is_shown_by_its_outcome():
     assert outcome == "    solved 4 of 5, 1 INVALID_DATA,"
     value = known.value[[0, 1, 3, 4]]
     assert values.startswith(f"    value from {value.min():.4g} to {value.max():.4g}, residual up")
-
-
-def test_a_solution_without_values_or_elements_is_shown():
-    known = known_qp(0, batch=(3,))
-    meta = QuadraticProgram(*(x.to("meta") for x in known.qp.tensors()), check_values=False)
-    assert "device='meta'" in repr(solve_qp(meta, known.fixed.to("meta")))
-    assert "solved 0 of 0" in repr(solve_qp(known_qp(0, batch=(0,)).qp))
-    none = solve_qp(known.qp, known.fixed * torch.nan, on_failure="mask")
-    assert "solved 0 of 3, 3 INVALID_DATA" in repr(none)

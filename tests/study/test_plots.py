@@ -48,25 +48,3 @@ def test_the_papers_cases_have_their_colour_in_every_figure():
     frame = made_up({("gaussian", "si"): [0.9], ("gaussian", "mpc"): [0.8]})
     assert plots.colours(frame)["si"] == plots.colours(made_up({("brownian", "si"): [0.1]}))["si"]
     assert len({*plots.colours(frame).values()}) == 6
-
-
-def test_matrices_are_raw_and_canonical_beside_both_models(gaussian):
-    figure = plots.constraints_figure(gaussian)
-    images = {x.get_title(): np.asarray(x.images[0].get_array()) for x in figure.axes if x.images}
-    names = ("fixed", "free")
-    assert {*images} >= {"$C_0$, the start", "$C_0$ of the true model"}
-    learned = gaussian["run"].iloc[0].policy.C.detach().numpy()
-    np.testing.assert_array_equal(images["$C_\\theta$, fixed"], learned)
-    np.testing.assert_allclose(images["canonical, fixed"], learned, atol=1e-9)
-    raw, canonical = (images[title] for title in ("$C_\\theta$, free", "canonical, free"))
-    assert np.abs(raw - canonical).max() > 1e-3, "another gauge"
-    assert len(images) == 2 + 2 * len(names)
-
-
-def test_model_errors_are_points_with_labels(gaussian):
-    left, right = plots.meaning_figure(gaussian).axes
-    points = np.concatenate([dots.get_offsets() for dots in left.collections])
-    np.testing.assert_allclose(points, gaussian[["prediction_error_start", "prediction_error"]])
-    points = np.concatenate([dots.get_offsets() for dots in right.collections])
-    np.testing.assert_allclose(points[:, 1], 1 - gaussian[gaussian["real"]]["closed_gap"])
-    assert right.get_xlabel() == "prediction error, learned / corrupted"

@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.problems import CPU, known_qp, normal, programs_of
-from torch_qpmpc.qp.pipeline.arrays import Theta, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
@@ -90,13 +90,6 @@ def test_invalid_data_is_found_in_every_tensor(batch, matrices):
         valid = Programs.of(*parts.values(), bad, device=device)[0].valid()
         assert valid is not None
         assert valid.tolist() == [True, False, True, True]
-
-
-def test_theta_in_float32_is_solved_in_float64():
-    known = known_qp(0, dtype=torch.float32)
-    theta = Programs.of(*known.qp.tensors(), known.fixed)[0].theta
-    assert {x.dtype for x in theta} == {np.dtype(np.float64)}
-    assert isinstance(theta, Theta)
 
 
 def test_operands_with_equal_rows_are_shared():

@@ -68,46 +68,6 @@ def test_elimination_spans_the_solutions_of_the_equalities(name):
     assert_close(G_y, G @ T)
 
 
-def test_ranks_may_differ_within_a_batch():
-    C, unit = MIXED, torch.eye(8).double().repeat(2, 1, 1)
-    arrays = condense(theta_of(unit, C, normal(2, 4, 8)), 1).arrays
-    T, H = torch.from_numpy(arrays.T), torch.from_numpy(arrays.H)
-    assert T.shape[-1] == 1 + (7 - 3)
-    assert_close(C @ T[:, :, 1:], torch.zeros(2, 6, 4).double())
-    # Columns that the higher rank does not need are zero, and their variables fixed.
-    unused = (T[0, :, 1:] == 0).all(0)
-    assert int(unused.sum()) == 3
-    assert torch.linalg.eigvalsh(H).min() > 0.5
-
-
-def test_elimination_of_an_mpc_scheme_is_its_prediction_form():
-    n_x, n_u, N = 2, 1, 4
-    A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double(), torch.tensor([[0.0], [0.1]]).double()
-    C = banded_matrix(A, B, N).unsqueeze(0)
-    n_z = C.shape[-1]
-    unit = torch.eye(n_z).double().unsqueeze(0)
-    T = torch.from_numpy(condense(theta_of(unit, C, unit), n_x + n_u).arrays.T[0])
-    y = normal(n_x + N * n_u)
-    z = T @ y
-    x = y[:n_x]
-    for k in range(N):
-        u = y[n_x + k : n_x + k + 1]
-        assert_close(z[k * 3 : k * 3 + 3], torch.cat((x, u)))
-        x = A @ x + B @ u
-    assert_close(z[-n_x:], x)
-
-
-@pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
-def test_expanded_variables_satisfy_the_equalities(name):
-    C = (REGULAR | DEFICIENT)[name]
-    known = known_qp(3, n_z=8, n_f=3, C=C, batch=(5,), hard=())
-    programs, reduced = programs_of(known), reduced_of(known)
-    v = normal(5, reduced.H.shape[-1])
-    z = expanded(programs, v)
-    assert_close(z @ C.mT, known.qp.b)
-    assert_close(z[:, :3], known.fixed)
-
-
 @pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT, "mixed"])
 @pytest.mark.parametrize("n_f", [0, 1, 3])
 def test_equalities_of_any_rank_are_solved(name, n_f):

@@ -49,12 +49,6 @@ def test_a_change_in_place_is_another_theta_and_back_the_same(i):
     assert Programs.of(*theta, fixed)[0].prepared is one
 
 
-def test_the_dtype_is_part_of_a_theta():
-    theta, fixed = known_qp(0).qp.tensors(), normal(5, 2)
-    one = Programs.of(*theta, fixed)[0].prepared
-    assert Programs.of(*(x.float() for x in theta), fixed.float())[0].prepared is not one
-
-
 def test_only_the_latest_are_remembered():
     fixed = normal(5, 2)
     known = [known_qp(100 + i).qp.tensors() for i in range(LATEST + 1)]
@@ -99,17 +93,6 @@ def test_an_update_in_place_and_back_is_followed():
     assert_close(twin.value(s), before, rtol=0, atol=0)
     mpc.C.data.copy_(C)  # unseen by version counters
     assert_close(mpc.value(s), before, rtol=0, atol=0)
-
-
-def test_the_answer_follows_the_module():
-    online, s = random_mpc(42), random_states(4)
-    target = copy.deepcopy(online)
-    with torch.no_grad():
-        online.C += 0.05 * normal(*online.C.shape)
-    expected = [online.value(s), target.value(s)]
-    assert (expected[0] - expected[1]).abs().min() > 1e-6
-    for _ in range(2):
-        assert_close([online.value(s), target.value(s)], expected, rtol=0, atol=0)
 
 
 def test_the_answer_follows_the_parameters_of_a_functional_call():
