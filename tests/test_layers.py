@@ -70,7 +70,7 @@ BUDGET = {
     "control": 4309,
     "envs": 1534,
     "experiment": 3927,
-    "export": 1427,
+    "export": 1430,
     "learning": 2972,
     "mpc": 5481,
     "proofs": 1003,

@@ -39,6 +39,8 @@ CERTIFIED = 1e-5
 DOUBTFUL = 1e-9
 #: Examples of each kind.
 EACH = 3
+#: A centre that is nearer to a bound, relative to the distance of both, is at that bound.
+CENTRED = 1e-6
 #: Most times that an infeasible state is moved half way to the centre.
 HALVINGS = 12
 #: What a step of an infeasible state returns.
@@ -210,8 +212,9 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
     Y, lower, upper, *_ = (np.concatenate(pair) for pair in pairs)
+    span = np.where(np.isfinite(upper - lower), upper - lower, 0.0)  # a centre may be at a bound
     distances = (np.abs(x - Y @ tables.centre) for x in (lower, upper))
-    near = np.minimum(*(np.where(x > 0, x, np.inf) for x in distances))
+    near = np.minimum(*(np.where(x > CENTRED * span, x, np.inf) for x in distances))
     quantiles, scale = rng.uniform(0, 0.5, count), np.ones((count, tables.n_p))
     rounding = 1e-13 * np.abs(Y).max(initial=0)  # of entries without an effect
     for j, column in enumerate(np.abs(Y).T):

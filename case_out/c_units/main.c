@@ -1,0 +1,62 @@
+/* The closed loop of the controller with a plant: its model, at rest until a load comes. Put yours
+   in place of it.
+
+   Each line has the step, the outputs, the inputs and the code of policy_step. */
+#include <stdio.h>
+#include "policy.h"
+
+#if POLICY_N_X != 2 || POLICY_N_U != 2 || POLICY_N_Y != 2 || POLICY_N_D != 0 || POLICY_STAGES != 21 || POLICY_SET_POINTS != 1
+#error "main.c was written for another controller: delete it and export again"
+#endif
+
+typedef policy_real real;
+
+enum { STEPS = 200 };
+static const real A[2][2] =
+{
+{0.95, 0.0},
+{0.02, 0.9}};
+static const real B[2][2] =
+{
+{0.05, 0.0},
+{-0.01, 1e-06}};
+static const real C[2][2] =
+{
+{1.0, 0.0},
+{0.0, 1.0}};
+static const real LOAD[2] =
+{0.015000000000000003, 0.027};
+static const real R[2] =
+{0.5, 0.7};
+static const real KNOWN[1] =
+{0.0};
+static const real START_X[2] =
+{0.0, 0.0};
+static const real START_U[2] =
+{0.0, 0.0};
+
+int main(void)
+{
+    static policy_state state;
+    real x[POLICY_N_X], next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
+    int i, j, k, code = policy_selftest();
+    if (code) fprintf(stderr, "self-test: number %d fails\n", code);
+    policy_reset(&state, 0, START_U, 0);
+    for (i = 0; i < POLICY_N_X; i++) x[i] = START_X[i];
+    for (k = 0; k < STEPS && !code; k++) {
+        for (i = 0; i < POLICY_N_Y; i++)
+            for (y[i] = 0, j = 0; j < POLICY_N_X; j++) y[i] += C[i][j] * x[j];
+        code = policy_step(&state, y, R, KNOWN, u);
+        printf("%d", k);
+        for (i = 0; i < POLICY_N_Y; i++) printf(" %.6g", y[i]);
+        for (i = 0; i < POLICY_N_U; i++) printf(" %.6g", u[i]);
+        printf(" %d\n", code);
+        for (i = 0; i < POLICY_N_X; i++) {
+            next[i] = LOAD[i];
+            for (j = 0; j < POLICY_N_X; j++) next[i] += A[i][j] * x[j];
+            for (j = 0; j < POLICY_N_U; j++) next[i] += B[i][j] * u[j];
+        }
+        for (i = 0; i < POLICY_N_X; i++) x[i] = next[i];
+    }
+    return code;
+}

@@ -1,0 +1,59 @@
+/* The closed loop of the controller with a plant: its model, at rest until a load comes. Put yours
+   in place of it.
+
+   Each line has the step, the outputs, the inputs and the code of policy_step. */
+#include <stdio.h>
+#include "policy.h"
+
+#if POLICY_N_X != 1 || POLICY_N_U != 1 || POLICY_N_Y != 1 || POLICY_N_D != 1 || POLICY_STAGES != 9 || POLICY_SET_POINTS != 1
+#error "main.c was written for another controller: delete it and export again"
+#endif
+
+typedef policy_real real;
+
+enum { STEPS = 200 };
+static const real A[1][1] =
+{
+{0.9}};
+static const real B[1][1] =
+{
+{0.25}};
+static const real C[1][1] =
+{
+{1.0}};
+static const real LOAD[1] =
+{0.725};
+static const real R[1] =
+{18.250000000000004};
+static const real KNOWN[9] =
+{5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0, 5.0};
+static const real START_X[1] =
+{18.000000000000004};
+static const real START_U[1] =
+{5.2};
+
+int main(void)
+{
+    static policy_state state;
+    real x[POLICY_N_X], next[POLICY_N_X], y[POLICY_N_Y], u[POLICY_N_U];
+    int i, j, k, code = policy_selftest();
+    if (code) fprintf(stderr, "self-test: number %d fails\n", code);
+    policy_reset(&state, 0, START_U, 0);
+    for (i = 0; i < POLICY_N_X; i++) x[i] = START_X[i];
+    for (k = 0; k < STEPS && !code; k++) {
+        for (i = 0; i < POLICY_N_Y; i++)
+            for (y[i] = 0, j = 0; j < POLICY_N_X; j++) y[i] += C[i][j] * x[j];
+        code = policy_step(&state, y, R, KNOWN, u);
+        printf("%d", k);
+        for (i = 0; i < POLICY_N_Y; i++) printf(" %.6g", y[i]);
+        for (i = 0; i < POLICY_N_U; i++) printf(" %.6g", u[i]);
+        printf(" %d\n", code);
+        for (i = 0; i < POLICY_N_X; i++) {
+            next[i] = LOAD[i];
+            for (j = 0; j < POLICY_N_X; j++) next[i] += A[i][j] * x[j];
+            for (j = 0; j < POLICY_N_U; j++) next[i] += B[i][j] * u[j];
+        }
+        for (i = 0; i < POLICY_N_X; i++) x[i] = next[i];
+    }
+    return code;
+}

@@ -1,0 +1,365 @@
+/* policy: a linear MPC with an observer, by torch_qpmpc.
+   y and r: y1
+   known: d
+   u: u1 */
+#include "policy.h"
+
+/* An observer of e = [x; w], the state and constant disturbances; a QP for the steady state that is
+   nearest to the set-point, or two if that leaves inputs free; and a QP for the plan to it.
+
+       e  is corrected by L (y - H e), and predicted by F e + G u + E d + OFFSET
+       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QPs
+       u = u_s + the plan's first input, within the bounds */
+
+typedef policy_real real;
+
+enum { N_X = POLICY_N_X, N_W = POLICY_N_W, N_E = POLICY_N_E, N_U = POLICY_N_U };
+enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_A = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
+enum { N_V = N_A + POLICY_N_F, STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
+
+#define BIG 1e300
+static const real F[2][2] =
+{
+{0.9, 0.0},
+{0.0, 1.0}};
+static const real G[2][1] =
+{
+{0.25},
+{0.0}};
+static const real E[2][1] =
+{
+{0.1},
+{0.0}};
+static const real OFFSET[2] =
+{0.0, 0.0};
+static const real H[1][2] =
+{
+{1.0, 1.0}};
+static const real L[2][1] =
+{
+{0.015161484249997156},
+{0.6112328809705028}};
+static const real REST[2][3] =
+{
+{-10.000000000000027, 0.0, 2.5553502390747026e-16},
+{10.000000000000027, 0.0, 0.9999999999999998}};
+static const real X_V[1][1] =
+{
+{14.84910136373238}};
+static const real U_V[1][1] =
+{
+{5.939640545492952}};
+static const real Y_V[1][1] =
+{
+{14.84910136373238}};
+static const real X_L[1][3] =
+{
+{0.0, 0.4355472816007878, 0.0}};
+static const real U_L[1][3] =
+{
+{0.0, -0.22578108735968494, 0.0}};
+static const real Y_L[1][3] =
+{
+{1.0, 0.4355472816007878, 0.0}};
+static const real ACTS[1] =
+{1.0};
+static const real NOMINAL[1] =
+{0.0};
+static const real U_LOWER[1] =
+{-9.0};
+static const real U_UPPER[1] =
+{9.0};
+static const real MOVE_LOWER[1] =
+{-BIG};
+static const real MOVE_UPPER[1] =
+{BIG};
+static const real MOST_Y[1] =
+{225000000.0};
+static const real MOST_KNOWN[1] =
+{19764525271.71219};
+static const real MOST_U[1] =
+{900000000.0};
+static const int OF_Y[] = {0};
+static const int OF_U[] = {0};
+static const int LOWER_OF[] = {-1};
+static const int UPPER_OF[] = {-1};
+
+/* Add M x to y, where M has so many rows and columns. */
+static void add(real *y, const real *M, int rows, int columns, const real *x)
+{
+    int i, j;
+    for (i = 0; i < rows; i++)
+        for (j = 0; j < columns; j++) y[i] += M[i * columns + j] * x[j];
+}
+
+static void copy(real *to, const real *from, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) to[i] = from[i];
+}
+
+/* Return 1 if x is not above `most` in size; a NaN is. */
+static int is_sane(real x, real most) { return x <= most && -x <= most; }
+
+static int are_sane(const real *x, const real most[], int rows, int columns)
+{
+    int i;
+    for (i = 0; i < rows * columns; i++)
+        if (!is_sane(x[i], most[i % columns])) return 0;
+    return 1;
+}
+
+/* Return x within the bounds of input i, some of which are known signals: in the last valid row. */
+static real within(const policy_state *s, real x, int i)
+{
+    int seen = s->starts < 2;
+    real lower = seen && LOWER_OF[i] >= 0 ? s->known[LOWER_OF[i]] : U_LOWER[i];
+    real upper = seen && UPPER_OF[i] >= 0 ? s->known[UPPER_OF[i]] : U_UPPER[i];
+    if (x < lower) x = lower;
+    return x > upper ? upper : x;
+}
+
+/* Predict the estimates of the next step with the input u. */
+static void predict(policy_state *s, const real u[])
+{
+    real next[N_E];
+    copy(next, OFFSET, N_E);
+    add(next, &F[0][0], N_E, N_E, s->e);
+    add(next, &G[0][0], N_E, N_U, u);
+    add(next, &E[0][0], N_E, N_D, s->known);
+    copy(s->e, next, N_E);
+}
+
+/* Set the estimates to where the plant rests with outputs y and the last input. */
+static void rest(policy_state *s, const real y[])
+{
+    real known[N_E + N_Y];
+    int i;
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    predict(s, s->u);
+    for (i = 0; i < N_E; i++) known[i] = -s->e[i];
+    copy(known + N_E, y, N_Y);
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    add(s->e, &REST[0][0], N_E, N_E + N_Y, known);
+}
+
+/* Correct the estimates by those outputs that are not missing; return a code. Rows of known signals
+   that are not sane are not taken, the last ones hold. */
+static int see(policy_state *s, const real y[], const real known[], int stages)
+{
+    real error[N_Y];
+    int i, j, missing = 0, valid = are_sane(known, MOST_KNOWN, stages, N_D);
+    if (valid) {
+        copy(s->known, known, N_D);
+        if (s->starts) s->starts = 1;
+    }
+    if (s->starts) {
+        if (!valid || !y || !are_sane(y, MOST_Y, 1, N_Y)) return POLICY_INVALID;
+        rest(s, y);
+        s->starts = 0;
+    }
+    for (i = 0; i < N_Y; i++) {
+        error[i] = 0;
+        if (!y || !is_sane(y[i], MOST_Y[i])) {
+            missing = 1;
+            continue;
+        }
+        error[i] = y[i];
+        for (j = 0; j < N_E; j++) error[i] -= H[i][j] * s->e[j];
+    }
+    add(s->e, &L[0][0], N_E, N_Y, error);
+    return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
+}
+
+/* Set the target for the set-point of a stage; return the code of its QPs. */
+static int aim(policy_state *s, const real r[], const real level[])
+{
+    real loads[LOADS], t[N_A + POLICY_TARGET_N_P], v[N_V];
+    int i, code;
+    copy(loads, s->e + N_X, N_W);
+    copy(loads + N_W, level, N_D);
+    loads[LOADS - 1] = 1;
+    copy(t, r, N_Y);
+    copy(t + N_Y, loads, LOADS);
+    code = policy_target_step(&s->target, t, v, 0);
+#if POLICY_N_F
+    if (code == POLICY_SOLVED) {
+        copy(t, v, N_A);
+        copy(t + N_A, loads, LOADS);
+        code = policy_free_step(&s->free, t, v + N_A, 0);
+    }
+#endif
+    for (i = 0; i < N_X; i++) s->x_s[i] = 0;
+    for (i = 0; i < N_U; i++) s->u_s[i] = 0;
+    for (i = 0; i < N_Y; i++) s->y_s[i] = 0;
+    add(s->x_s, &X_V[0][0], N_X, N_V, v);
+    add(s->u_s, &U_V[0][0], N_U, N_V, v);
+    add(s->y_s, &Y_V[0][0], N_Y, N_V, v);
+    add(s->x_s, &X_L[0][0], N_X, LOADS, loads);
+    add(s->u_s, &U_L[0][0], N_U, LOADS, loads);
+    add(s->y_s, &Y_L[0][0], N_Y, LOADS, loads);
+    return code;
+}
+
+/* Replace the last input by the plan's; return a code. */
+static int plan(policy_state *s, const real known[])
+{
+    /* a stage of p has set-points and inputs relative to the target if it has any, then known ones */
+    enum { N_R = POLICY_N_R, N_UR = POLICY_N_UR, N_K = N_R + N_UR + N_D };
+    real level[POLICY_N_D_] = {0}, move[N_U], *p = s->p;
+    int i, k, code;
+    for (i = 0; i < N_D; i++) {
+        for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i] - NOMINAL[i];
+        level[i] /= (real)STAGES;
+    }
+    for (k = 0; k < SET_POINTS; k++) {
+        if ((code = aim(s, s->r + k * N_Y, level)) != POLICY_SOLVED) return code;
+        copy(p + k * N_K, s->y_s, N_R);
+        copy(p + k * N_K + N_R, s->u_s, N_UR);
+    }
+    for (k = 0; k < STAGES; k++) {
+        for (i = 0; i < N_R; i++) *p++ -= s->y_s[i];
+        for (i = 0; i < N_UR; i++) *p++ -= s->u_s[i];
+        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - NOMINAL[i] - ACTS[i] * level[i];
+    }
+    for (i = 0; i < N_X; i++) *p++ = s->e[i] - s->x_s[i];
+    for (i = 0; i < POLICY_MOVES; i++) *p++ = s->u[i] - s->u_s[i];
+    for (i = 0; i < POLICY_BOUNDED_Y; i++) *p++ = s->y_s[OF_Y[i]];
+    for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
+    *p = 1;
+    if ((code = policy_plan_step(&s->plan, s->p, move, 0)) != POLICY_SOLVED) return code;
+    for (i = 0; i < N_U; i++) {
+        real by = (move[i] = within(s, s->u_s[i] + move[i], i)) - s->u[i];
+        if (!(by >= MOVE_LOWER[i] && by <= MOVE_UPPER[i])) return POLICY_LIMIT;
+    }
+    copy(s->u, move, N_U);
+    return code;
+}
+
+void policy_reset(policy_state *s, const real y[], const real u[], const real known[])
+{
+    int i;
+    policy_plan_reset(&s->plan);
+    policy_target_reset(&s->target);
+#if POLICY_N_F
+    policy_free_reset(&s->free);
+#endif
+    for (i = 0; i < N_E; i++) s->e[i] = 0;
+    for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;
+    s->starts = 2;
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
+    for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
+    if (y && are_sane(y, MOST_Y, 1, N_Y) && (!N_D || (known && are_sane(known, MOST_KNOWN, 1, N_D)))) {
+        copy(s->known, known, N_D);
+        rest(s, y);
+        s->starts = 0;
+    }
+}
+
+int policy_observe(policy_state *s, const real y[], const real u[], const real known[])
+{
+    int i, code = see(s, y, known, 1);
+    real applied[N_U];
+    for (i = 0; i < N_U; i++) applied[i] = u && is_sane(u[i], MOST_U[i]) ? u[i] : s->u[i];
+    if (!s->starts) predict(s, applied);
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, applied[i], i);
+    return code;
+}
+
+int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
+{
+    int i, code, seen = see(s, y, known, STAGES), sane = !r || are_sane(r, MOST_Y, SET_POINTS, N_Y);
+    if (r && sane) copy(s->r, r, SET_POINTS * N_Y);
+    code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
+    for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
+    if (!s->starts) predict(s, s->u);
+    copy(u, s->u, N_U);
+    return code ? code : seen;
+}
+
+#define EXAMPLES 10
+static const real EXAMPLE_Y[10][1] =
+{
+{4.991323831856784},
+{2.2897517739103366},
+{1.2632359108975157},
+{2.380475269924283},
+{-0.24990079182652933},
+{1.6857867803798245},
+{1.388608124271167},
+{1.8361884263385844},
+{2.0505782069220535},
+{1.993692311777878}};
+static const real EXAMPLE_R[10][1] =
+{
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095},
+{5.2739233741429095}};
+static const real EXAMPLE_KNOWN[10][9] =
+{
+{-20.01045464385692, -7.318723866032331, 5.816788363186852, -40.95312950285781, 0.6756866289652388,
+ -19.62483840328608, -9.472916637686204, -5.757020421039673, -1.2515224340046727},
+{-7.318723866032331, 5.816788363186852, -40.95312950285781, 0.6756866289652388, -19.62483840328608,
+ -9.472916637686204, -5.757020421039673, -1.2515224340046727, 13.135682138774992},
+{5.816788363186852, -40.95312950285781, 0.6756866289652388, -19.62483840328608, -9.472916637686204,
+ -5.757020421039673, -1.2515224340046727, 13.135682138774992, 25.60478183644763},
+{-40.95312950285781, 0.6756866289652388, -19.62483840328608, -9.472916637686204,
+ -5.757020421039673, -1.2515224340046727, 13.135682138774992, 25.60478183644763,
+ 2.4595734059516263},
+{0.6756866289652388, -19.62483840328608, -9.472916637686204, -5.757020421039673,
+ -1.2515224340046727, 13.135682138774992, 25.60478183644763, 2.4595734059516263, 32.00750179655081},
+{-19.62483840328608, -9.472916637686204, -5.757020421039673, -1.2515224340046727,
+ 13.135682138774992, 25.60478183644763, 2.4595734059516263, 32.00750179655081, -8.147256934734513},
+{-9.472916637686204, -5.757020421039673, -1.2515224340046727, 13.135682138774992,
+ 25.60478183644763, 2.4595734059516263, 32.00750179655081, -8.147256934734513, 11.947429663614813},
+{-5.757020421039673, -1.2515224340046727, 13.135682138774992, 25.60478183644763,
+ 2.4595734059516263, 32.00750179655081, -8.147256934734513, 11.947429663614813, 22.856659237495574},
+{-1.2515224340046727, 13.135682138774992, 25.60478183644763, 2.4595734059516263, 32.00750179655081,
+ -8.147256934734513, 11.947429663614813, 22.856659237495574, 6.858108434946537},
+{13.135682138774992, 25.60478183644763, 2.4595734059516263, 32.00750179655081, -8.147256934734513,
+ 11.947429663614813, 22.856659237495574, 6.858108434946537, -9.69490970335239}};
+static const real EXAMPLE_U[10][1] =
+{
+{-1.4094525145778456},
+{-0.5992020710794876},
+{2.2754184606505934},
+{6.315281901577327},
+{6.872044109539228},
+{6.929945216535586},
+{5.612512961358558},
+{3.45372279366089},
+{0.6854765590493397},
+{-2.4768454606986623}};
+static const real EXAMPLE_START[1][1] =
+{
+{-1.9999979450346927e-10}};
+static const real NEAR_U[1] =
+{9e-06};
+
+int policy_selftest(void)
+{
+    static policy_state state;
+    real u[N_U];
+    int i, j;
+    if (policy_plan_selftest()) return 1;
+    if (policy_target_selftest()) return 2;
+#if POLICY_N_F
+    if (policy_free_selftest()) return 2;
+#endif
+    policy_reset(&state, 0, EXAMPLE_START[0], 0);
+    for (i = 0; i < EXAMPLES; i++) {
+        if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;
+        for (j = 0; j < N_U; j++) {
+            real off = u[j] - EXAMPLE_U[i][j];
+            if (!(off <= NEAR_U[j] && -off <= NEAR_U[j])) return 3 + i;
+        }
+    }
+    return 0;
+}

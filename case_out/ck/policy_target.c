@@ -1,0 +1,624 @@
+/* policy_target: the policy and value of a quadratic program, by torch_qpmpc 0.1.0 on 2026-11-27.
+   SHA-256 of H, q, c, C, b, G, lb, ub, w: 653b5f2af1a6b4acf7504eb823d21f7dffeccc5cae17ae8de356d750de232d42
+   
+   p[0 .. 3]: x_0
+   u[0]: u_0 */
+#include "policy_target.h"
+
+/* A QP in the multipliers of its rows, by a dual active-set method.
+
+   Without multipliers the rows are y_free(p), the action is u_free(p) and the value is v_free(p).
+   Multipliers lambda move them to
+
+       y = y_free(p) - Q lambda,   u = u_free(p) - F lambda,
+
+   and are optimal if each row is in one of these states:
+
+       FREE        lambda = 0,       lower <= y <= upper
+       HELD        0 < lambda < w,   y = upper        or  -w < lambda < 0,  y = lower
+       SATURATED   lambda = w,       y >= upper       or  lambda = -w,      y <= lower
+
+   A hard row has w = BIG. The rows are scaled to Q[i][i] = 1. One iteration holds the row that is
+   furthest from its conditions, and moves the multipliers of the held rows towards their optimum;
+   a row whose multiplier meets 0 or w on the way is let go. The dual objective never decreases.
+   The multipliers' intervals do not depend on p: those of the last step are a feasible start. */
+
+typedef policy_target_real real;
+
+enum { FREE = 0, HELD = 1, SATURATED = 2, IGNORED = 3 }; /* of kind; negative at the lower bound */
+
+#define BIG 1e300
+#define TOLERANCE 1e-11
+#define TIGHT 1e-14
+#define EPSILON 2.2e-16
+#define ROUNDING 4e-15
+#define DEPENDENT 1e-12
+#define NOISE 1e-10
+#define FEASIBLE 1e-8
+#define KNOWN_FEASIBLE 1e-6
+#define GAP 1e-9
+#define COARSE 1e-7
+#define MAX_ITERATIONS 120
+#define REFINEMENTS 3
+static const real Y_P[1][4] =
+{
+{1.4142135623730954, -1.4142135623730954, -1.4142135623730956, 0.0}};
+static const real Y_LOWER[1] =
+{-31.819805153394643};
+static const real Y_UPPER[1] =
+{31.819805153394643};
+static const real W[1] =
+{BIG};
+static const real SIZE[1] =
+{31.819805153394643};
+static const real UNIT[1] =
+{0.03142696805273544};
+static const real Q[1][1] =
+{
+{1.0}};
+static const real KNOWN_P[1][4] =
+{
+{0.0, 0.0, 0.0, 0.0}};
+static const real KNOWN_LOWER[1] =
+{0.0};
+static const real KNOWN_UPPER[1] =
+{0.0};
+static const real KNOWN_W[1] =
+{0.0};
+static const real U_P[1][4] =
+{
+{0.0673441426187858, -0.0673441426187858, -0.029331558249347914, 0.0}};
+static const real U_OFFSET[1] =
+{0.0};
+static const real U_LAMBDA[1][1] =
+{
+{0.047619499918937415}};
+static const real U_LOWER[1] =
+{-BIG};
+static const real U_UPPER[1] =
+{BIG};
+static const real V_PP[10] =
+{-7.753950908146005e-18, 1.550790181629201e-17, -7.753950908146005e-18, -2.6699183358395777e-17,
+ 2.6699183358395777e-17, 5.010533659916729e-18, 0.0, 0.0, 0.0, 0.091};
+static const real V_P[4] =
+{0.0, 0.0, 0.0, 0.0};
+static const real V_OFFSET = 0.0;
+
+static real absolute(real x) { return x < 0 ? -x : x; }
+static real larger(real a, real b) { return a > b ? a : b; }
+static real smaller(real a, real b) { return a < b ? a : b; }
+static int is_finite(real x) { return x - x == 0; }
+
+/* Four sums at once: a compiler may not reorder one. */
+static real dot(const real *a, const real *b, int n)
+{
+    real s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    int i;
+    for (i = 0; i + 3 < n; i += 4) {
+        s0 += a[i] * b[i];
+        s1 += a[i + 1] * b[i + 1];
+        s2 += a[i + 2] * b[i + 2];
+        s3 += a[i + 3] * b[i + 3];
+    }
+    for (; i < n; i++) s0 += a[i] * b[i];
+    return (s0 + s1) + (s2 + s3);
+}
+
+static void add(real *a, real factor, const real *b, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) a[i] += factor * b[i];
+}
+
+#if POLICY_TARGET_FACTORED /* the table is R with Q = R R' */
+
+static real entry(int i, int j) { return dot(R[i], R[j], POLICY_TARGET_D); }
+
+/* Update y to the multipliers that have changed since the last call. */
+static void respond(policy_target_state *s)
+{
+    real *plan = s->work + 2 * POLICY_TARGET_HELD_;
+    int i;
+    for (i = 0; i < POLICY_TARGET_D; i++) plan[i] = 0;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        if (s->lambda[i] == s->before[i]) continue;
+        add(plan, s->lambda[i] - s->before[i], R[i], POLICY_TARGET_D);
+        s->before[i] = s->lambda[i];
+    }
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) s->y[i] -= dot(R[i], plan, POLICY_TARGET_D);
+}
+
+#else
+
+static real entry(int i, int j) { return Q[i][j]; }
+
+/* Update y to the multipliers that have changed since the last call. */
+static void respond(policy_target_state *s)
+{
+    int i;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        if (s->lambda[i] == s->before[i]) continue;
+        add(s->y, s->before[i] - s->lambda[i], Q[i], POLICY_TARGET_ROWS);
+        s->before[i] = s->lambda[i];
+    }
+}
+
+#endif
+
+/* Compute y from all multipliers. */
+static void respond_anew(policy_target_state *s)
+{
+    int i;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        s->y[i] = s->y_free[i];
+        s->before[i] = 0;
+    }
+    respond(s);
+}
+
+/* Return the bound that a row is held at. */
+static real bound(const policy_target_state *s, int row)
+{
+    return s->kind[row] > 0 ? Y_UPPER[row] : Y_LOWER[row];
+}
+
+/* Return the ends of the interval of a row's multiplier; equal bounds hold it on both sides. */
+static real lowest(int row, int side)
+{
+    return side > 0 && Y_LOWER[row] < Y_UPPER[row] ? 0 : -W[row];
+}
+
+static real highest(int row, int side)
+{
+    return side < 0 && Y_LOWER[row] < Y_UPPER[row] ? 0 : W[row];
+}
+
+/* The factor: column i of L, from below its unit diagonal. */
+static real *column(policy_target_state *s, int i)
+{
+    return s->lower + (i * (POLICY_TARGET_HELD - 1) - (i * (i - 1)) / 2);
+}
+
+/* Solve L x = x. */
+static void solve_lower(policy_target_state *s, real *x, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) add(x + i + 1, -x[i], column(s, i), n - 1 - i);
+}
+
+/* Solve D L' x = x. */
+static void solve_upper(policy_target_state *s, real *x, int n)
+{
+    int i;
+    for (i = n - 1; i >= 0; i--)
+        x[i] = x[i] / s->diagonal[i] - dot(column(s, i), x + i + 1, n - 1 - i);
+}
+
+/* Append a row to the factor; return 0 if it depends on the held rows.
+
+   x becomes the solution of L x = Q[held][row] in either case. */
+static int append(policy_target_state *s, int row, real *x)
+{
+    real pivot = 1;
+    int i, n = s->n_held;
+    for (i = 0; i < n; i++) x[i] = entry(row, s->held[i]);
+    solve_lower(s, x, n);
+    for (i = 0; i < n; i++) pivot -= x[i] * x[i] / s->diagonal[i];
+    if (n == POLICY_TARGET_HELD || pivot <= DEPENDENT) return 0;
+    for (i = 0; i < n; i++) column(s, i)[n - 1 - i] = x[i] / s->diagonal[i];
+    s->diagonal[n] = pivot;
+    s->held[n] = row;
+    s->n_held++;
+    return 1;
+}
+
+/* Remove the held row at a position, by a rank-one update of the rows after it. */
+static void drop(policy_target_state *s, int at)
+{
+    real *removed = s->work + POLICY_TARGET_HELD_, weight = s->diagonal[at];
+    int i, j, n = --s->n_held;
+    for (i = 0; i < at; i++) { /* the columns before it lose an entry */
+        real *l = column(s, i);
+        for (j = at - i - 1; j < n - i - 1; j++) l[j] = l[j + 1];
+    }
+    for (j = at; j < n; j++) removed[j] = column(s, at)[j - at];
+    for (i = at; i < n; i++) { /* those after it move */
+        const real *from = column(s, i + 1);
+        real *to = column(s, i);
+        for (j = 0; j < n - 1 - i; j++) to[j] = from[j];
+        s->diagonal[i] = s->diagonal[i + 1];
+        s->held[i] = s->held[i + 1];
+    }
+    for (i = at; i < n; i++) { /* L D L' + weight removed removed' */
+        real *l = column(s, i), *v = removed + i + 1, c = removed[i];
+        real old = s->diagonal[i], beta;
+        s->diagonal[i] = old + weight * c * c;
+        beta = weight * c / s->diagonal[i];
+        weight *= old / s->diagonal[i];
+        for (j = 0; j < n - 1 - i; j++) {
+            v[j] -= c * l[j];
+            l[j] += beta * v[j];
+        }
+    }
+}
+
+/* Factorise the held rows anew. */
+static void refactor(policy_target_state *s)
+{
+    int i, n = s->n_held;
+    s->n_held = 0;
+    for (i = 0; i < n; i++) {
+        int row = s->held[i];
+        if (!append(s, row, s->work)) {
+            s->lambda[row] = 0;
+            s->kind[row] = FREE;
+        }
+    }
+}
+
+/* Let go the held row at a position, whose multiplier has met an end of its interval. */
+static void release(policy_target_state *s, int at, real end)
+{
+    int row = s->held[at];
+    s->lambda[row] = end;
+    s->kind[row] = (signed char)(end > 0 ? SATURATED : end < 0 ? -SATURATED : FREE);
+    drop(s, at);
+}
+
+/* Return the longest step in [0, most] along x that keeps the held multipliers in their intervals,
+   the position of the row that stops it in *at (-1 if none does) and its end in *end. Entries of x
+   up to `noise` are rounding. */
+static real longest(const policy_target_state *s, const real *x, real noise, real most, int *at, real *end)
+{
+    int i;
+    *at = -1;
+    for (i = 0; i < s->n_held; i++) {
+        int row = s->held[i];
+        real to = x[i] > 0 ? highest(row, s->kind[row]) : lowest(row, s->kind[row]);
+        real room = to - s->lambda[row];
+        if (absolute(x[i]) > noise && absolute(to) < BIG && absolute(most * x[i]) > absolute(room)) {
+            most = larger(0, room / x[i]);
+            *at = i;
+            *end = to;
+        }
+    }
+    return most;
+}
+
+static void move(policy_target_state *s, const real *x, real step)
+{
+    int i;
+    for (i = 0; i < s->n_held; i++) s->lambda[s->held[i]] += step * x[i];
+}
+
+/* Move the held multipliers to their optimum, letting go those that meet an end on the way. */
+static void settle(policy_target_state *s, int *iterations)
+{
+    real *x = s->work, left = 1, step, end = 0;
+    int i, at;
+    while (s->n_held > 0 && *iterations < MAX_ITERATIONS) {
+        for (i = 0; i < s->n_held; i++) {
+            int row = s->held[i];
+            x[i] = left * (s->y[row] - bound(s, row));
+        }
+        solve_lower(s, x, s->n_held);
+        solve_upper(s, x, s->n_held);
+        step = longest(s, x, 0, 1, &at, &end);
+        move(s, x, step);
+        if (at < 0) return;
+        release(s, at, end);
+        left *= 1 - step;
+        ++*iterations;
+    }
+}
+
+/* Hold a row that violates its conditions by `excess`; return 0 if that proves infeasibility.
+
+   If the row depends on the held ones, the multipliers move along the dependence, which changes
+   no y and increases the dual objective, until one of them meets an end. */
+static int hold(policy_target_state *s, int row, int side, real excess, int *iterations)
+{
+    real *x = s->work, sign = excess > 0 ? 1 : -1;
+    while (!append(s, row, x)) {
+        real most = BIG, end = 0, own, room, step;
+        int i, at;
+        solve_upper(s, x, s->n_held);
+        for (i = 0; i < s->n_held; i++) x[i] *= -sign;
+        own = sign > 0 ? highest(row, side) : lowest(row, side);
+        room = absolute(own - s->lambda[row]);
+        if (absolute(own) < BIG) most = room;
+        step = longest(s, x, NOISE, most, &at, &end);
+        if (step >= BIG) {
+            s->kind[row] = IGNORED;
+            return absolute(excess) <= FEASIBLE * s->size[row];
+        }
+        move(s, x, step);
+        s->lambda[row] += sign * step;
+        ++*iterations;
+        if (at < 0) {
+            s->lambda[row] = own;
+            s->kind[row] = (signed char)(own > 0 ? SATURATED : own < 0 ? -SATURATED : FREE);
+            return 1;
+        }
+        release(s, at, end);
+    }
+    s->kind[row] = (signed char)(side > 0 ? HELD : -HELD);
+    return 1;
+}
+
+/* Return the row that is furthest from its conditions, its side and its excess; -1 if none is off.
+
+   *settled is 0 if a held row is not at its bound. */
+static int worst(const policy_target_state *s, real tolerance, int *side, real *excess, int *settled)
+{
+    real sum = 0, gain = 0;
+    int i, found = -1;
+    *settled = 1;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) sum += absolute(s->lambda[i]);
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        int kind = s->kind[i];
+        real above = s->y[i] - Y_UPPER[i], below = s->y[i] - Y_LOWER[i], off = 0, size, length;
+        if (kind == FREE) off = above > 0 ? above : smaller(below, 0);
+        else if (kind == SATURATED) off = smaller(above, 0);
+        else if (kind == -SATURATED) off = larger(below, 0);
+        else if (kind != IGNORED) off = kind > 0 ? above : below;
+        size = absolute(off);
+        if (size <= tolerance * s->size[i] + ROUNDING * sum) continue;
+        if (kind == HELD || kind == -HELD) {
+            *settled = 0;
+            continue;
+        }
+        length = smaller(size, W[i]);
+        if (length * (size - length / 2) > gain) { /* of the dual objective, by this row alone */
+            gain = length * (size - length / 2);
+            found = i;
+            *side = kind == FREE ? (off > 0 ? 1 : -1) : kind;
+            *excess = off;
+        }
+    }
+    return found;
+}
+
+/* Solve from the multipliers of the state, with rows exact to a tolerance relative to their size. */
+static int solve(policy_target_state *s, real tolerance, int *iterations)
+{
+    int refinements = 0;
+    respond_anew(s);
+    for (;;) {
+        real excess = 0;
+        int row, side = 0, settled;
+        settle(s, iterations);
+        respond(s);
+        row = worst(s, tolerance, &side, &excess, &settled);
+        if (row < 0) { /* judge y without the rounding of its updates */
+            respond_anew(s);
+            row = worst(s, tolerance, &side, &excess, &settled);
+        }
+        if (row < 0 && (settled || refinements++ == REFINEMENTS)) return POLICY_TARGET_SOLVED;
+        if (*iterations >= MAX_ITERATIONS) return POLICY_TARGET_LIMIT;
+        if (row < 0) continue;
+        ++*iterations;
+        if (!hold(s, row, side, excess, iterations)) return POLICY_TARGET_INFEASIBLE;
+    }
+}
+
+/* Return the distance of y to its bounds. */
+static real distance(real y, real lower, real upper)
+{
+    return y > upper ? y - upper : y < lower ? lower - y : 0;
+}
+
+/* Certify the multipliers: complete the value and the info; return 1 if they are optimal. */
+static int certify(const policy_target_state *s, real v_free, policy_target_info *info)
+{
+    real quadratic = 0, charges = 0, sum = 0, terms;
+    int i, holds = 1;
+    info->gap = 0;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) sum += absolute(s->lambda[i]);
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        real y = s->y[i], lambda = s->lambda[i], off = distance(y, Y_LOWER[i], Y_UPPER[i]);
+        real charge = W[i] < BIG ? W[i] * off : 0;
+        if (W[i] >= BIG) {
+            info->violation = larger(info->violation, off * UNIT[i]);
+            if (!(off <= FEASIBLE * s->size[i] + ROUNDING * sum)) holds = 0;
+        }
+        if (lambda != 0) {
+            real at = lambda > 0 ? Y_UPPER[i] : Y_LOWER[i];
+            info->gap += absolute(charge + lambda * (at - y));
+            quadratic += lambda * (s->y_free[i] - y) / 2;
+        } else {
+            info->gap += charge;
+        }
+        charges += charge;
+    }
+    info->value += v_free + quadratic + charges;
+    /* rounding of the entries of Q alone moves the value by up to EPSILON sum^2 */
+    terms = absolute(v_free) + absolute(quadratic) + charges;
+    return holds && info->gap <= larger(GAP * terms, smaller(COARSE * terms, EPSILON * sum * sum));
+}
+
+/* Write u for the current multipliers, within the action bounds. */
+static void act(policy_target_state *s, const real p[], real u[])
+{
+    int i;
+    for (i = 0; i < POLICY_TARGET_N_U; i++) {
+        real x = U_OFFSET[i] + dot(U_P[i], p, POLICY_TARGET_N_P) - dot(U_LAMBDA[i], s->lambda, POLICY_TARGET_ROWS);
+        if (is_finite(x)) s->u[i] = smaller(larger(x, U_LOWER[i]), U_UPPER[i]);
+        u[i] = s->u[i];
+    }
+}
+
+/* Compute what depends on p alone; return 0 if it is not finite. */
+static int prepare(policy_target_state *s, const real p[], real *v_free)
+{
+    const real *row = V_PP;
+    real sum = V_OFFSET, check = 0;
+    int i, j;
+    for (i = 0; i < POLICY_TARGET_N_P; i++) {
+        sum += p[i] * (V_P[i] + dot(row, p, i + 1));
+        row += i + 1;
+    }
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        real y = 0, size = SIZE[i];
+        for (j = 0; j < POLICY_TARGET_N_P; j++) {
+            real term = Y_P[i][j] * p[j];
+            y += term;
+            size += absolute(term);
+        }
+        s->y_free[i] = y;
+        s->size[i] = size;
+        check += size;
+        if (s->kind[i] == IGNORED) {
+            s->kind[i] = FREE;
+            s->lambda[i] = 0;
+        }
+    }
+    *v_free = sum;
+    return is_finite(check) && is_finite(sum);
+}
+
+/* Judge the rows that p alone determines; return 0 if a hard one is violated. */
+static int judge(const real p[], policy_target_info *info)
+{
+    int i, holds = 1;
+    for (i = 0; i < POLICY_TARGET_KNOWN; i++) {
+        real y = dot(KNOWN_P[i], p, POLICY_TARGET_N_P);
+        real off = distance(y, KNOWN_LOWER[i], KNOWN_UPPER[i]);
+        if (KNOWN_W[i] < BIG) {
+            info->value += KNOWN_W[i] * off;
+        } else {
+            info->violation = larger(info->violation, off);
+            if (off > KNOWN_FEASIBLE * (1 + absolute(y))) holds = 0;
+        }
+    }
+    return holds;
+}
+
+/* Forget the active set, but not the last action. */
+static void restart(policy_target_state *s)
+{
+    int i;
+    s->n_held = 0;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) {
+        s->lambda[i] = 0;
+        s->kind[i] = FREE;
+    }
+}
+
+void policy_target_reset(policy_target_state *s)
+{
+    int i;
+    restart(s);
+    for (i = 0; i < POLICY_TARGET_N_U; i++) s->u[i] = smaller(larger(0, U_LOWER[i]), U_UPPER[i]);
+}
+
+int policy_target_step(policy_target_state *s, const real p[], real u[], policy_target_info *info)
+{
+    policy_target_info local;
+    real v_free = 0, value, violation;
+    int i, code, feasible, finite = 1, fresh = 0, cold = 1;
+    if (!info) info = &local;
+    info->value = info->gap = info->violation = 0;
+    info->iterations = 0;
+    for (i = 0; i < POLICY_TARGET_N_P; i++) finite = finite && is_finite(p[i]);
+    if (!finite || !prepare(s, p, &v_free)) {
+        restart(s);
+        for (i = 0; i < POLICY_TARGET_N_U; i++) u[i] = s->u[i];
+        return POLICY_TARGET_INVALID;
+    }
+    feasible = judge(p, info);
+    value = info->value;
+    violation = info->violation;
+    for (i = 0; i < POLICY_TARGET_ROWS; i++) cold = cold && s->lambda[i] == 0;
+    for (;;) { /* from the last active set, with a new factor and tight rows, and from none */
+        code = solve(s, fresh ? TIGHT : TOLERANCE, &info->iterations);
+        info->value = value;
+        info->violation = violation;
+        if (!certify(s, v_free, info) && code == POLICY_TARGET_SOLVED) {
+            code = POLICY_TARGET_LIMIT;
+            if (!fresh) {
+                refactor(s);
+                fresh = 1;
+                continue;
+            }
+        }
+        if (code == POLICY_TARGET_SOLVED || cold || info->iterations >= MAX_ITERATIONS) break;
+        restart(s);
+        cold = 1;
+        fresh = 0;
+    }
+    act(s, p, u);
+    return feasible ? code : POLICY_TARGET_INFEASIBLE;
+}
+
+/* States of the self-test: interior, interior, interior, at bounds, at bounds, at bounds. */
+#define EXAMPLES 6
+static const int EXAMPLE_CODE[] = {0, 0, 0, 0, 0, 0};
+static const real EXAMPLE_P[6][4] =
+{
+{-4.013524238515498, -8.491335937290557, -1.4186066491428422, 1.0},
+{-15.262403921887053, -14.177906113059034, 15.653593902377317, 1.0},
+{-6.818586511315009, -14.813676751856345, -2.11528826791809, 1.0},
+{-27.081189941265862, -38.79856591308014, -25.839657402112596, 1.0},
+{-24.15929443434093, 5.477793337199477, 18.048208756993496, 1.0},
+{-11.077132528346905, -22.880100829405325, -28.455720089709473, 1.0}};
+static const real EXAMPLE_U[6][1] =
+{
+{0.3431643332246206},
+{-0.5321788764666923},
+{0.6004671984536798},
+{0.533011051847505},
+{-0.8291841508302372},
+{0.43356774821949023}};
+static const real EXAMPLE_VALUE[6] =
+{0.09100000000000003, 0.09100000000000166, 0.09099999999999998, 226.8052540235478,
+ 634.390161230182, 315.4620133603945};
+static const real NEAR_U[1] =
+{2.805430165380393e-06};
+static const real NEAR_VALUE[6] =
+{0.00019326818083205362, 0.00019326818083205362, 0.00019326818083205362, 0.00019326818083205362,
+ 0.00019326818083205362, 0.00019326818083205362};
+
+static int near(real x, real expected, real tolerance) { return absolute(x - expected) <= tolerance; }
+
+/* With an operating system each thread has its own; without one a stack may be too small. */
+#if defined(__GNUC__) && (defined(__unix__) || defined(__APPLE__))
+#define OWN static __thread
+#elif defined(_MSC_VER)
+#define OWN static __declspec(thread)
+#else
+#define OWN static
+#endif
+
+int policy_target_selftest(void)
+{
+    OWN policy_target_state state;
+    OWN real p[POLICY_TARGET_N_P], u[POLICY_TARGET_N_U];
+    policy_target_info info;
+    volatile real zero = 0;
+    int round, i, j;
+    for (round = 0; round < 2; round++) { /* cold, then from the last active set */
+        policy_target_reset(&state);
+        for (i = 0; i < EXAMPLES; i++) {
+            int code, good;
+            if (round == 0) policy_target_reset(&state);
+            code = policy_target_step(&state, EXAMPLE_P[i], u, &info);
+            good = code == EXAMPLE_CODE[i];
+            if (code == POLICY_TARGET_LIMIT && info.iterations >= MAX_ITERATIONS) good = 1;
+            for (j = 0; j < POLICY_TARGET_N_U; j++) {
+                good = good && u[j] >= U_LOWER[j] && u[j] <= U_UPPER[j];
+                if (code == POLICY_TARGET_SOLVED) good = good && near(u[j], EXAMPLE_U[i][j], NEAR_U[j]);
+            }
+            if (code == POLICY_TARGET_SOLVED) good = good && near(info.value, EXAMPLE_VALUE[i], NEAR_VALUE[i]);
+            if (!good) return i + 1;
+        }
+    }
+    for (j = 0; j < POLICY_TARGET_N_P; j++) p[j] = 0;
+    for (round = 0; round < 2; round++) { /* a NaN and an infinity */
+        p[POLICY_TARGET_N_P - 1] = (round ? 1 : zero) / zero;
+        if (policy_target_step(&state, p, u, 0) != POLICY_TARGET_INVALID) return EXAMPLES + 1;
+        for (j = 0; j < POLICY_TARGET_N_U; j++)
+            if (!(u[j] >= U_LOWER[j] && u[j] <= U_UPPER[j])) return EXAMPLES + 1;
+    }
+    return 0;
+}
