@@ -17,7 +17,7 @@ from tests.benchmarks.problems import GAMMA, PAPER, Transitions, make_mpc, move,
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.qp.solvers import BACKENDS
 
-BATCHES = (1, 32, 256, 1024)
+BATCHES = (1, 256, 1024)
 REFERENCE = next(iter(PEERS))
 #: Relative change of theta since the solutions that warm starts use.
 MOVED = 1e-3
@@ -64,7 +64,6 @@ class Contender:
     label: str
     solver: str
     make: Callable[[QPMPC, Transitions], Gradient]
-    threads: int = 1
     largest: int = BATCHES[-1]
     fast: bool = True
     ours: bool = True
@@ -108,8 +107,6 @@ def _ours() -> list[Contender]:
     contenders = []
     for name in BACKENDS:
         contenders.append(Contender(name, name, cold))
-        if name == "proxqp":
-            contenders.append(Contender(f"{name}, 2 threads", name, cold, threads=2))
         contenders.append(Contender(f"{name}, warm", name, warm))
     return contenders
 

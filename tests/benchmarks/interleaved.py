@@ -22,7 +22,6 @@ class Interleaved:
         *,
         rounds: int,
         warmup: int = 1,
-        threads: int = 1,
         before: Callable[[], Any] | None = None,
         reference: Callable[[], Any] | None = None,
         every: int = 1,
@@ -49,7 +48,6 @@ class Interleaved:
             done += 1
             if before is not None:
                 before()
-            torch.set_num_threads(threads)
 
         result = self._benchmark.pedantic(timed, setup=setup, rounds=rounds, warmup_rounds=warmup)
         if seconds:

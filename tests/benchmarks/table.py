@@ -70,8 +70,8 @@ def conditions(machine: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in machine["versions"].items())
     return (
         f"Measured in one run on {cpu.get('count', '?')} cores ({cpu.get('brand_raw', 'unknown')}) "
-        f"with Python {machine['python_version']}, {versions}. One thread unless a row "
-        "says two; medians of wall-clock time after a warm-up."
+        f"with Python {machine['python_version']}, {versions}. One thread; medians "
+        "of wall-clock time after a warm-up."
     )
 
 

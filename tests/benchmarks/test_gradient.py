@@ -17,19 +17,19 @@ from torch import Tensor
 from tests.benchmarks.contenders import BATCHES, CONTENDERS, REFERENCE, Contender, Gradient
 from tests.benchmarks.problems import PAPER, make_mpc, nudge, transitions
 from tests.benchmarks.reference import WRONG, reference_values, relative_error
+from tests.benchmarks.table import CASES as COLUMNS
 
 pytest.importorskip("pytest_benchmark", reason="benchmarks need pip install '.[bench]'")
 
 #: Rounds of a fast contender by batch, and the number of them between two of the reference.
-ROUNDS = {1: (60, 15), 32: (60, 15), 256: (60, 15), 1024: (9, 3)}
-SLOW_ROUNDS = {1: 5, 32: 3, 256: 1, 1024: 1}
+ROUNDS = {1: (60, 15), 256: (60, 15), 1024: (9, 3)}
+SLOW_ROUNDS = {1: 5, 256: 1, 1024: 1}
 #: Batches with interleaved rounds of the reference.
-INTERLEAVED = (1, 32, 256)
+INTERLEAVED = (1, 256)
 
 CASES = [
     pytest.param(contender, dense, batch, id=f"{'dense' if dense else 'banded'}-{batch}-{label}")
-    for dense in (True, False)
-    for batch in BATCHES
+    for dense, batch in COLUMNS
     for contender in CONTENDERS
     if batch <= contender.largest
     for label in [contender.label.replace(" ", "_")]
@@ -47,7 +47,6 @@ def test_gradient(
         gradient.step,
         rounds=rounds,
         warmup=1 if contender.fast or batch <= 32 else 0,
-        threads=contender.threads,
         before=lambda: nudge(gradient.mpc),
         reference=_reference(dense, batch).step if against else None,
         every=every,
