@@ -178,6 +178,14 @@ def test_a_guide_is_short_begins_with_a_script_and_has_a_picture(page):
 
 
 @needs_docs
+def test_the_documentation_is_short():
+    pages = [text for page, text in PAGES.items() if page.startswith("docs/")]
+    assert len(pages) <= 40
+    assert sum(len(text.split()) for text in pages) <= 22_000
+    assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split()) <= 400
+
+
+@needs_docs
 def test_the_readme_is_short_and_its_links_lead_somewhere():
     readme = PAGES["README.md"]
     assert len(readme.splitlines()) <= 110

@@ -13,7 +13,7 @@ import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from importlib import import_module
@@ -22,19 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.modules import AdditiveGaussianModule
 
 import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
-from tests.benchmarks.problems import GAMMA, PAPER, make_mpc, transitions
+from tests.benchmarks.problems import PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
 from tests.benchmarks.table import significant
-from torch_qpmpc.envs import PointMass, PointMassEnv
-from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
-from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
-from torch_qpmpc.learning.updates import second_order
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
@@ -43,10 +37,6 @@ BATCHES = (1, 4_096, 65_536, 262_144)
 #: The batch of the comparison, and of the rows of qpax, which needs more memory.
 LARGE, OF_QPAX = 65_536, 16_384
 ROUNDS = 7
-#: The whole loop: environments, steps of an episode, stored steps.
-NUM_ENVS, STEPS, STORED = 16_384, 50, 20
-#: Further updates before these, untimed.
-WARM_UP = 5
 
 
 def synchronise() -> None:
@@ -190,86 +180,6 @@ def comparison(device: torch.device, count: int = LARGE) -> str:
     return table(["", "batch", "cold", "warm"], lines)
 
 
-# The whole loop
-
-
-def learn(
-    device: torch.device, solver: str, updates: int, pairs: int, num_envs: int
-) -> Iterator[dict[str, Any]]:
-    """Learn the point mass, and yield the scalars of the start, and of the end."""
-    A, B, W = PointMass().corrupted(1)
-    mpc = qm.QPMPC.from_model(
-        A,
-        B,
-        10,
-        gamma=GAMMA,
-        stage_weight=torch.cat((W, torch.zeros(2).double())),
-        terminal_weight=torch.ones(4),
-        state_bounds=([-2.0, -2.0, -10.0, -10.0], [2.0, 2.0, 10.0, 10.0]),
-        action_bounds=([-1.0] * 2, [1.0] * 2),
-        state_slack=100.0,
-        solver=solver,
-        on_failure="mask",
-    ).to(device)
-    operator = qm.QPActorValueOperator(mpc, active_set_key=ACTIVE_SET)
-    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
-    env = PointMassEnv(num_envs=num_envs, max_steps=STEPS, seed=1, device=device)
-    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3, device=device)
-    explorer = TensorDictSequential([actor, noise])
-    loss_module = qm.QPQLearningLoss(operator)
-    loss_module.make_value_estimator(gamma=GAMMA)
-    update = second_order(mpc, loss_module, qm.GaussNewton(mpc), None, None)
-    replay = Replay(num_envs * STORED, num_envs, pairs, 1, 1, device=device, active_rows=len(mpc.G))
-
-    @torch.no_grad()
-    def cost() -> float:
-        """Return the mean cost of an episode, without exploration, from starts that stay."""
-        episode = PointMassEnv(num_envs=min(num_envs, 2_048), seed=100, device=device)
-        return -float(episode.rollout(STEPS, actor)["next", "reward"].sum(1).mean())
-
-    yield {"J": cost()}
-    current, collecting, began = env.reset(), 0.0, 0.0
-    for i in range(-WARM_UP, updates):
-        if i == 0:
-            synchronise()
-            collecting, began = 0.0, time.perf_counter()
-        before = time.perf_counter()
-        with torch.no_grad():
-            step, current = env.step_and_maybe_reset(explorer(current))
-        synchronise()
-        collecting += time.perf_counter() - before
-        replay.extend(step.exclude(POLICY_ACTIVE_SET).unsqueeze(1))
-        update(batch := replay.sample(), None)
-        replay.remember(batch)
-    synchronise()
-    elapsed = time.perf_counter() - began
-    yield {
-        "J": cost(),
-        "rate": updates * num_envs / elapsed,
-        "step": 1e3 * collecting / updates,
-        "update": 1e3 * (elapsed - collecting) / updates,
-    }
-
-
-def loops(device: torch.device, num_envs: int = NUM_ENVS) -> str:
-    """Return the table of the whole loop, on the device, and with DAQP on the CPU."""
-    lines = []
-    cpu = torch.device("cpu")
-    torch.set_num_threads(1)
-    for name, where, solver, updates, pairs in (
-        ("torch, on the GPU", device, "torch", 100, 4_096),
-        ("torch, on the GPU", device, "torch", 100, 1_024),
-        ("daqp, on one core", cpu, "daqp", 20, 1_024),
-    ):
-        start, end = learn(where, solver, updates, pairs, num_envs)
-        times = [significant(end[x]) for x in ("step", "update")]
-        costs = f"{start['J']:.1f} to {end['J']:.1f}"
-        count = f"{updates + WARM_UP}"
-        lines.append([name, f"{pairs:,}", *times, f"{end['rate']:,.0f}", count, costs])
-    head = ["", "pairs", "ms a step", "ms an update", "transitions a second", "updates", "J"]
-    return table(head, lines)
-
-
 def report(device: torch.device) -> str:
     card = torch.cuda.get_device_name() if device.type == "cuda" else "the CPU, for a trial"
     return "\n\n".join(
@@ -280,9 +190,6 @@ def report(device: torch.device) -> str:
             curve(device),
             "**Beside other solvers**, in microseconds per QP:",
             comparison(device),
-            f"**The whole loop**: {NUM_ENVS:,} point masses take a step, then `GaussNewton` an "
-            "update on replayed pairs. J is the cost of an episode before and after the updates:",
-            loops(device),
         )
     )
 

@@ -445,7 +445,7 @@ def outcomes(rows: Any) -> str:
         J += [float(runs["start"].max()), float(runs["reference"].median())]
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse = (runs["excess"] > ERRORS * runs["error"]).sum()
-        names = (name.removesuffix(", first log") for name in runs["chosen"])
+        names = (x.removesuffix(", first log").removeprefix("MPC of the ") for x in runs["chosen"])
         tail = [f"{worse} of {len(runs)}", "; ".join(dict.fromkeys(names))]
         lines.append([name, *cells, *tail])
     head = ["plant", "zero action", "start, median", "worst", "reference"]
