@@ -14,9 +14,9 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 FIRST = ("config", "optimizer/gauss_newton", "constraint/combined", "task/point_mass")
 TITLE = """# All configuration keys
 
-Each key is set by `python train.py KEY=VALUE`, or with others by a choice, as `task=pendulum`; the
-rightmost choice of `defaults` in `configs/config.yaml` that sets a key counts. The usual value
-comes first, and those of single choices follow. Units are the plant's unless the meaning says
+You set a key by `python train.py KEY=VALUE`, or several by a choice, as `task=pendulum`. If several
+choices set a key, the rightmost of `defaults` in `configs/config.yaml` counts. The usual value
+comes first, then the values of single choices. Units are the plant's unless the meaning says
 otherwise.
 """
 GROUPS = {
@@ -84,7 +84,7 @@ def values(of: list[Setting]) -> str:
 
 def page() -> str:
     """Return the page as Markdown."""
-    text = [TITLE, "## Of every run\n"]
+    text = [TITLE, "## Every run\n"]
     head = "| key | meaning | values |\n| --- | --- | --- |"
     for group in ("", *GROUPS):
         text += [f"\n## {GROUPS[group]}\n"] if group else []
