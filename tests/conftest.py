@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf, _utils, base, grammar_parser
 
 import train
+from tests import kernels
 from tests.runs import SMALL, make_config
 from torch_qpmpc.control import exporting
 from torch_qpmpc.experiment.tasks import identified
@@ -46,7 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         config.option.dist = "worksteal"
-        if config.option.markexpr != "slow":  # these run after the others, which compile them
+        if not kernels.up_to_date():
             command = [sys.executable, "-m", "tests.kernels"]
             config.stash[COMPILING] = subprocess.Popen(command, cwd=config.rootpath)
 

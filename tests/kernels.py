@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import tempfile
+from pathlib import Path
 
-import train
-from tests.campaign.families import FAMILIES, Draw
-from tests.runs import SMALL, make_config
-from torch_qpmpc import solve_qp
+import torch_qpmpc.qp.kernels
+
+FOLDER = Path(torch_qpmpc.qp.kernels.__file__).parent
+#: Written when all kernels are compiled.
+DONE = FOLDER / "__pycache__" / "compiled"
+
+
+def up_to_date() -> bool:
+    """Compare the time of the last compilation with those of the kernels' files."""
+    changed = max(file.stat().st_mtime for file in FOLDER.glob("*.py"))
+    return DONE.exists() and DONE.stat().st_mtime > changed
 
 
 def compile_kernels() -> None:
     """Train briefly and solve a QP of large numbers, which calls nearly every kernel."""
+    import train
+    from tests.campaign.families import FAMILIES, Draw
+    from tests.runs import SMALL, make_config
+    from torch_qpmpc import solve_qp
+
     for override in ("optimizer=gauss_newton", "optimizer=adam", "step=projection"):
         with tempfile.TemporaryDirectory() as folder:
             train.train(make_config(*SMALL, override), folder, quiet=True)
     case = FAMILIES["scaled cost"](Draw(7), 3)
     solve_qp(case.known.qp, case.known.fixed, solver="daqp")
+    DONE.parent.mkdir(exist_ok=True)
+    DONE.touch()
 
 
 if __name__ == "__main__":

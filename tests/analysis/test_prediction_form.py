@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import model_form, normal, predict, times
+from tests.problems import normal, predict, times
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.structure import canonical_matrix, prediction_form, stage_models
+from torch_qpmpc.analysis.structure import prediction_form
 from torch_qpmpc.mpc.banded import banded_matrix
 
 N_X, N_U, N = 3, 2, 5
@@ -33,30 +33,6 @@ def gauge(seed: int) -> Tensor:
     return normal(N * N_X, N * N_X, seed=100 + seed)
 
 
-@pytest.mark.parametrize("stages", [(), (N,)], ids=["tied", "varying"])
-def test_predictions_are_those_of_stepping_the_model(stages):
-    A, B = scheme(stages)
-    form = model_form(A, B, N, OFFSET)
-    x_0, U = normal(4, N_X), normal(4, N, N_U, seed=1)
-    predicted = predict(form, x_0, U)
-    A, B = A.expand(N, N_X, N_X), B.expand(N, N_X, N_U)
-    x = x_0
-    for k in range(N):
-        x = x @ A[k].mT + U[:, k] @ B[k].mT + OFFSET[k]
-        torch.testing.assert_close(predicted[:, k], x, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", ["tied", "varying", "free"])
-@pytest.mark.parametrize("seed", range(2))
-def test_the_form_does_not_depend_on_the_gauge(kind, seed):
-    C, b = constraints(kind, seed)
-    T = gauge(seed)
-    form, other = prediction_form(C, N_X, N_U, b), prediction_form(T @ C, N_X, N_U, T @ b)
-    for part in ("Phi", "Gamma", "phi"):
-        expected = getattr(form, part)
-        assert (getattr(other, part) - expected).norm() < 1e-10 * expected.norm()
-
-
 def test_blocks_and_maps_are_the_form():
     form = prediction_form(*_of("free"))
     x_0, U = normal(N_X), normal(N, N_U, seed=1)
@@ -77,16 +53,6 @@ def test_a_batch_is_its_elements():
         alone = prediction_form(C_i, N_X, N_U, b_i)
         for part in ("Phi", "Gamma", "phi", "condition", "maps", "blocks"):
             torch.testing.assert_close(getattr(form, part)[i], getattr(alone, part))
-
-
-@pytest.mark.parametrize("kind", ["tied", "varying"])
-def test_the_canonical_matrix_of_a_scheme_is_banded_in_any_gauge(kind):
-    C_0, b_0 = constraints(kind)
-    T = gauge(0)
-    form = prediction_form(T @ C_0, N_X, N_U, T @ b_0)
-    C, b = canonical_matrix(form, stage_models(form).A)
-    torch.testing.assert_close(C, C_0, rtol=0, atol=1e-9)
-    torch.testing.assert_close(b, b_0, rtol=0, atol=1e-9)
 
 
 def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:

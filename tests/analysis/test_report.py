@@ -76,17 +76,6 @@ def test_the_gain_is_taken_at_the_given_state():
     assert (read(mpc).K.abs() > 0.1).any()
 
 
-def test_printed_as_a_table():
-    found = read(scheme(), (A, B))
-    lines = str(found).splitlines()
-    table = dict(line.split() for line in lines[: len(found.scalars())])
-    assert {name: float(text) for name, text in table.items()} == pytest.approx(
-        found.scalars(), rel=1e-3, abs=1e-12
-    )
-    assert lines[len(table)].split() == ["A", "1.0000", "0.1300"]
-    assert len(lines) == len(table) + 2 + 2 + 1
-
-
 def test_metrics_are_those_of_the_report():
     mpc = scheme()
     with torch.no_grad():

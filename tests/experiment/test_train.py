@@ -317,6 +317,7 @@ def test_runs_that_start_in_the_same_second_have_folders_of_their_own():
 
 
 SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task.eval_steps=5")
+SHORT += ("rivals=false",)
 
 
 def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
@@ -324,7 +325,7 @@ def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
     A, B, W = PointMass().A.tolist(), PointMass().B.tolist(), torch.eye(6).tolist()
     model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
     id = "torch_qpmpc/PointMass-v0"
-    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false")
+    run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false", "gate=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
     summary = json.loads((folder / "summary.json").read_text())

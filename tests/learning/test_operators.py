@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import pickle
 from typing import Any
 
 import pytest
@@ -125,22 +124,6 @@ def test_one_set_of_parameters_drives_every_view():
             assert torch.equal(view(td.clone())[view.out_keys[0]], x)
         assert torch.equal(view(td.clone())[view.out_keys[0]], y), "put back afterwards"
         assert not torch.equal(x, y)
-
-
-@pytest.mark.parametrize("how", ["deepcopy", "pickle", "state_dict"])
-def test_copies(how):
-    operator, td = QPActorValueOperator(make_mpc()), make_inputs(4)
-    change(operator.module)
-    if how == "deepcopy":
-        twin = copy.deepcopy(operator)
-    elif how == "pickle":
-        twin = pickle.loads(pickle.dumps(operator))
-    else:
-        twin = QPActorValueOperator(make_mpc())
-        twin.load_state_dict(operator.state_dict())
-    expected = evaluate(operator, td)
-    change(operator.module)
-    assert all(torch.equal(x, y) for x, y in zip(evaluate(twin, td), expected, strict=True))
 
 
 # --- Policies with warm starts in closed loop ----------------------------------------------------

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from typing import Any
 
 import pytest
 import torch
 from torchrl.data import MultiStep
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
-from torchrl.objectives import HardUpdate, SoftUpdate
 
 from tests.transitions import (
     GAMMA,
@@ -22,20 +19,6 @@ from tests.transitions import (
     perturb,
 )
 from torch_qpmpc import QPActorValueOperator
-
-
-@pytest.mark.filterwarnings("ignore:No target network updater")
-@pytest.mark.parametrize("delay_value", [False, True])
-def test_state_dict_round_trip(delay_value):
-    first = make_loss(delay_value=delay_value)
-    second = make_loss(delay_value=delay_value)
-    perturb(first)
-    state = first.state_dict()
-    second.load_state_dict(state)
-    assert state.keys() == second.state_dict().keys()
-    assert all(torch.equal(value, second.state_dict()[key]) for key, value in state.items())
-    td = make_batch(6)
-    assert torch.equal(first(td.clone())["loss_value"], second(td.clone())["loss_value"])
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -63,40 +46,6 @@ def test_multi_step_returns(n):
     out = make_loss(operator=operator, reduction="none")(batch)
     delta = expected - hand_prediction(operator.module, td)
     torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=1e-6, rtol=0)
-
-
-def test_target_network_updaters():
-    loss = make_loss(delay_value=True)
-    with pytest.warns(UserWarning, match="No target network updater"):
-        loss(make_batch(2))
-    soft = SoftUpdate(loss, tau=0.25)
-    start = copy.deepcopy(loss.value_network)
-    perturb(loss)
-    soft.step()
-    target, online = loss.target_value_network_params, loss.value_network_params
-    for key, leaf in learned_leaves(loss).items():
-        old = dict(start.named_parameters())[".".join(key)].detach()
-        torch.testing.assert_close(target[key], old + 0.25 * (leaf.detach() - old))
-
-    hard = HardUpdate(loss, value_network_update_interval=1)
-    perturb(loss)
-    C = ("module", "C")
-    assert not torch.equal(target[C], online[C])
-    hard.step()
-    hard.step()
-    assert torch.equal(target[C], online[C])
-
-
-@pytest.mark.parametrize("how", ["deepcopy", "pickle"])
-def test_copies_are_independent_and_whole(how):
-    loss, td = make_loss("tdlambda"), make_batch(3, 4)
-    expected = loss(td.clone())["loss_value"]
-    twin = copy.deepcopy(loss) if how == "deepcopy" else pickle.loads(pickle.dumps(loss))
-    perturb(loss)
-    out = twin(td.clone())["loss_value"]
-    assert torch.equal(out, expected)
-    perturb(twin)  # Q, and V inside the estimator, both follow the copy's parameters
-    assert torch.equal(twin(td.clone())["loss_value"], loss(td.clone())["loss_value"])
 
 
 class Spy(QPActorValueOperator):
