@@ -18,6 +18,7 @@ import itertools
 import math
 import signal
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched
+from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched, settled
 from torch_qpmpc.experiment.metrics import (
     draw_outcome,
     report,
@@ -55,13 +56,8 @@ from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import (
-    COMMAND,
-    make_mpc,
-    make_physics,
-    named_task,
-    resume_arguments,
-)
+from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.code import COMMAND, named_task, resume_arguments
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -155,11 +151,11 @@ def _train(
         bar = tqdm(desc=label, initial=tally.update, total=cfg.updates, **rest)
         progress = stack.enter_context(bar)
         for update in range(tally.update + 1, cfg.updates + 1):
-            with tally.timed() as watch:
+            with tally.timed() as times:
                 batch = next(stream)
                 learner.loss_module.observe(batch)
                 replay.extend(batch)
-                watch.collected()
+                times.append(time.perf_counter())
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
                 long_enough = (warm_up + update) * cfg.steps_per_update >= cfg.task.horizon
@@ -173,7 +169,7 @@ def _train(
             progress.update()
 
             if update % cfg.log_interval == 0:
-                run.log(update_metrics(terms, losses, tally, watch, mpc, learner), update)
+                run.log(update_metrics(terms, losses, tally, times, mpc, learner), update)
             if update == cfg.release:
                 mpc.release()
                 learner = make_learner(cfg, operator, update, plant)
@@ -218,10 +214,10 @@ def _train(
 @hydra.main(version_base="1.3", config_path=CONFIGS, config_name="config")
 def _run(cfg: DictConfig) -> float:
     """Train, and return the closed gap, which an optimising sweeper can maximise."""
-    with launched() as launch:
-        cfg, state, summary = launch.settle(cfg)
+    with launched() as (folder, sweep):
+        cfg, state, summary = settled(cfg, folder, sweep)
         if summary is None:
-            summary = train(cfg, launch.folder, state, quiet=launch.sweep)
+            summary = train(cfg, folder, state, quiet=sweep)
     return summary["closed_gap"]
 
 

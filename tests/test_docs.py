@@ -18,7 +18,8 @@ import torch_qpmpc
 from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
 from tests.runs import SMALL, make_config
 from torch_qpmpc.experiment.config import check_config
-from torch_qpmpc.experiment.tasks import TASKS, named_task
+from torch_qpmpc.experiment.tasks import TASKS
+from torch_qpmpc.experiment.tasks.code import named_task
 from torch_qpmpc.qp import solvers
 
 #: Pages whose Python takes more than a few seconds.
@@ -104,7 +105,7 @@ def test_modules_that_commands_run_exist(module):
 @needs_docs
 @pytest.mark.slow
 def test_the_task_of_the_guide_trains(tmp_path):
-    """As a script, in the runs of a sweep, which are processes of their own, with one line."""
+    """As a script, in the runs of a sweep, which are processes of their own."""
     blocks = [code for _, code in fenced(PAGES["docs/guides/task.md"], "python")]
     (script,) = (code for code in blocks if "register(" in code)
     (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
@@ -120,8 +121,7 @@ def test_the_task_of_the_guide_trains(tmp_path):
         check=False,
     )
     assert ended.returncode == 0, ended.stderr
-    assert "2/2" in ended.stderr
-    assert "done=2" in ended.stderr
+    assert "2 out of   2" in ended.stderr
     assert "deviation, none" not in ended.stderr, "a run's own bar"
     assert "closed gap" not in ended.stdout, "a run's own table"
     summary = json.loads((tmp_path / "sweep/none-identified-seed2/summary.json").read_text())

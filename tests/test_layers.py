@@ -66,16 +66,16 @@ LAYERS = {
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 435,
-    "analysis": 1160,
+    "analysis": 1097,
     "control": 4309,
     "envs": 1534,
-    "experiment": 3927,
+    "experiment": 3635,
     "export": 1430,
-    "learning": 2972,
-    "mpc": 5481,
+    "learning": 2871,
+    "mpc": 5380,
     "proofs": 1003,
     "qp": 5934,
-    "study": 613,
+    "study": 614,
 }
 #: Libraries that only some layers may import.
 RESERVED = {

@@ -29,12 +29,11 @@ from torch_qpmpc.analysis.structure import (
     nearest_model,
     one_step_error,
     prediction_form,
-    second_moment,
 )
 from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
-from torch_qpmpc.learning.replay import Replay, windows_to_tau
+from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
 from torch_qpmpc.mpc.riccati import lqr_gain
@@ -102,12 +101,6 @@ def transposed() -> None:
     replay = R()
     replay.extend(make_batch(3, 2))
     replay.sample()
-
-
-def forgotten() -> None:
-    replay = R(active_rows=3)
-    replay.extend(make_batch(2, 8))
-    replay.remember(replay.sample().exclude("active_set"))
 
 
 def other_rows() -> None:
@@ -195,20 +188,8 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("windows: got shape (11, 6), expected shape (M, 11).", lambda: si(zeros(5, 11), mpc.C.mT)),
     ("C: got QPMPC, expected a floating-point torch.Tensor.", lambda: si(mpc, zeros(1, 11))),
     ("windows: got shape (2, 3, 11), expected shape (M,", lambda: si.curvature(zeros(2, 3, 11))),
-    ("batch_size: got 0, expected a whole number >= 1.", lambda: Replay(64, 2, 0, 3, 2)),
-    ("window: got 0, expected a whole number >= 1.", lambda: Replay(64, 2, 4, 0, 2)),
-    ("num_windows: got 0, expected a whole number >= 1.", lambda: Replay(64, 2, 4, 3, 0)),
-    ("capacity: got -64, expected a whole number >= 0.", lambda: Replay(-64, 2, 4, 3, 2)),
-    ("num_envs: got -2, expected a whole number >= 1.", lambda: Replay(64, -2, 4, 3, 2)),
-    ("seed: got 'a', expected a whole number >= 0 and < 2^63.", lambda: R(seed="a")),
-    ("active_rows: got -1, expected a whole number >= 0.", lambda: R(active_rows=-1)),
-    ("replay: got nothing stored, expected transitions. Call extend()", lambda: R().sample()),
     ("batch: got list, expected a TensorDictBase. Pass the collector's", lambda: R().extend([1])),
     ("batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it", transposed),
-    ("sample: got no entry active_set, expected one. Pass what sample() returned,", forgotten),
-    ("state: got no generator, storage, writer, expected what", lambda: R().load_state_dict({})),
-    ("windows: got Tensor, expected a TensorDictBase.", lambda: windows_to_tau(S)),
-    ("windows: got shape (4,) with observation", lambda: windows_to_tau(TD(observation=S))),
     # Analysis
     ("C: got shape (11,), expected shape (*batch, N", lambda: prediction_form(zeros(11), 2, 1)),
     ("n_x: got 0, expected a whole number >= 1.", lambda: prediction_form(mpc.C_0, 0, 1)),
@@ -240,7 +221,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("K: got shape (2, 1), expected shape", lambda: spectral_radius(A2, B1, zeros(2, 1).double())),
     ("A, B, K: got NaN or inf", lambda: spectral_radius(A2 * nan, B1, zeros(1, 2).double())),
     ("x: got NaN or inf, expected finite entries.", lambda: policy_map(mpc, [nan], [0.0])),
-    ("s: got list, expected a floating-point torch.Tensor.", lambda: second_moment([0.0], [0.0])),
     ("model: got tuple, expected a NearestModel. Pass", lambda: one_step_error((A2, B1), A2, B1)),
     ("offset: got shape (3,), expected", lambda: one_step_error(model, A2, B1, zeros(3).double())),
     ("moment: got shape (3, 3), expected", lambda: one_step_error(model, A2, B1, moment=eye(3))),

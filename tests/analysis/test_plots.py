@@ -94,11 +94,6 @@ def test_plans_are_those_of_the_qp():
     [
         ({"y": Y[1:]}, r"y: got shape \(6, 2\), expected shape \(7, n_y\)"),
         ({"u": Y}, r"u: got shape \(7, 2\), expected shape \(6, n_u\)"),
-        ({"references": Y[:, :1]}, r"references: got shape \(7, 1\), expected shape \(7, 2\)"),
-        ({"signals": {"price": Y[:3, 0]}}, r"signals\['price'\]: got .*, expected at least 6"),
-        ({"band": (LOWER, UPPER[1:])}, r"band, upper: got .*, expected shape \(2,\) or \(7, 2\)"),
-        ({"outputs": ["room"]}, r"outputs: got \['room'\], expected 2 names"),
-        ({"actions": "u"}, "actions: got 'u', expected 1 names"),
     ],
 )
 def test_what_does_not_fit_is_named(options, message):

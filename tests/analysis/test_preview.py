@@ -240,10 +240,6 @@ def test_a_map_is_one_of_x_0():
             lambda: DeviationPenalty(torch.zeros(3, 11), 1, 1, n_d=-1),
             "n_d: got -1, expected a whole number >= 0",
         ),
-        (
-            lambda: second_moment(normal(4, 2), normal(4, 1), normal(3, 1)),
-            r"s, a, d: got shapes \(4, 2\), \(4, 1\) and \(3, 1\)",
-        ),
     ],
 )
 def test_bad_input(call, message):

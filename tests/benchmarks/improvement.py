@@ -23,8 +23,8 @@ from omegaconf import DictConfig
 import train
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
+from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.costs import cost_text
-from torch_qpmpc.experiment.evaluation import rival_costs
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log
@@ -78,8 +78,9 @@ def configuration(case: Case, seed: int) -> DictConfig:
 def fixed_costs(case: str) -> dict[str, float]:
     """Return J of the case's other rivals, the best of them, and of its reference."""
     cfg, (_, reference, others, _) = configuration(CASES[case], 1), CASES[case]
-    cfg.rivals = [*others, *([] if reference is None else [reference])]
-    J = rival_costs(cfg, make_physics(cfg))
+    names, physics = [*others, *([] if reference is None else [reference])], make_physics(cfg)
+    rivals = find_task(cfg.task).rivals
+    J = {name: evaluate(cfg, rivals[name](physics), physics).J for name in names}
     other = min((J[name] for name in others), default=np.nan)
     return {"other": other, "reference": np.nan if reference is None else J[reference]}
 

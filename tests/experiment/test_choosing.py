@@ -27,6 +27,8 @@ from torch_qpmpc.experiment.choosing import (
     ESTIMATE,
     FIRST,
     OUTPUTS,
+    STARTS,
+    Choice,
     below,
     candidates,
     choose,
@@ -35,7 +37,6 @@ from torch_qpmpc.experiment.choosing import (
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.choice import STARTS, Choice, Row
 from torch_qpmpc.experiment.tasks.identified import estimated
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc import stage_cost
@@ -135,13 +136,13 @@ def test_the_candidates_have_the_regulators_cost(monkeypatch):
 
 def test_a_start_that_costs_less_than_zero_action_is_chosen():
     cfg, _, start, choice = chosen(*DATA, "task.start_episodes=6")
-    rows = choice.rows
+    rows = choice.table
     assert start.held is None
-    assert {OUTPUTS, f"{OUTPUTS}{FIRST}", ZERO_ACTION} <= {*rows}
-    assert rows[choice.name].episodes == rows[ZERO_ACTION].episodes == 6
-    assert rows[choice.name].J < rows[ZERO_ACTION].J
-    assert sorted(row.episodes for row in rows.values())[-3:] == [6, 6, 6]
-    steps = sum(row.episodes for row in rows.values()) * cfg.task.eval_steps
+    assert {OUTPUTS, f"{OUTPUTS}{FIRST}", ZERO_ACTION} <= {*rows.index}
+    assert rows.episodes[choice.name] == rows.episodes[ZERO_ACTION] == 6
+    assert rows.J[choice.name] < rows.J[ZERO_ACTION]
+    assert rows.episodes.tolist()[:3] == [6, 6, 6]
+    steps = rows.episodes.sum() * cfg.task.eval_steps
     assert start.summary["start_transitions"] == steps
     assert f"{steps:,} transitions beside the logs'" in str(choice)
 
@@ -180,7 +181,9 @@ def test_a_log_of_ones_own_is_the_first_one(tmp_path, episodes):
     again = make_start(cfg, physics, tmp_path / "run", written=True)
     assert start is not None
     assert again is not None
-    assert again.choice == start.choice
+    assert again.choice is not None
+    assert start.choice is not None
+    pd.testing.assert_frame_equal(again.choice.table, start.choice.table, check_names=False)
     np.testing.assert_array_equal(again.model.A, start.model.A)
     logs = below(own, own[..., :-1])
     assert len(logs) == 2 * (episodes or 1)
@@ -331,7 +334,7 @@ def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     assert (cut / STARTS).read_bytes() == (whole / STARTS).read_bytes()
     (cut / STARTS).rename(tmp_path / STARTS)
-    with pytest.raises(SystemExit, match=r"starts\.csv: got no file, .* Start a new run"):
+    with pytest.raises(SystemExit, match=r"starts\.csv: got .*No such file.* Start a new run"):
         run_command(f"resume={cut}")
     (tmp_path / STARTS).rename(cut / STARTS)
     with monkeypatch.context() as patch:
@@ -347,26 +350,27 @@ def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
     assert torch.equal(runs[0].start.C, runs[1].start.C)
 
 
+def table(*rows: tuple[Any, ...], names: list[str]) -> pd.DataFrame:
+    return pd.DataFrame(rows, names, ["episodes", "J", "error", "transitions", "chosen"])
+
+
 def test_the_table_is_kept_and_damage_is_named(tmp_path):
-    zero = Row(4, 2.0, 0.0, 40, 40.0, False)
-    rows = {"a, b": Row(4, 0.1 + 0.2, 1 / 3, 40, 80 / 3, True), ZERO_ACTION: zero}
-    Choice(rows).write(tmp_path)
+    rows = (4, 2.0, 0.0, 40, False), (4, 0.1 + 0.2, 1 / 3, 40, True)
+    choice = Choice(table(*rows, names=[ZERO_ACTION, "a, b"]))
+    choice.write(tmp_path)
     again = Choice.read(tmp_path)
-    assert again is not None
     assert again.summary == {"start": "a, b", "start_transitions": 80}
-    assert again.rows["a, b"] == rows["a, b"]
-    assert "Its episodes end after 7 of 10 steps in the mean." in str(again)
-    assert Choice.read(tmp_path / "other") is None
-    table = pd.read_csv(tmp_path / STARTS)
-    table["chosen"] = False
-    table.to_csv(tmp_path / STARTS, index=False)
+    assert again.scheme == "a, b"
+    pd.testing.assert_frame_equal(again.table, choice.table, check_names=False, check_exact=True)
+    again.table["chosen"] = False
+    again.write(tmp_path)
     with pytest.raises(QPError, match=r"starts\.csv: got .*expected the table of starts"):
         Choice.read(tmp_path)
 
 
-def test_a_table_of_other_logs_is_named():
+def test_a_table_of_other_logs_is_named(tmp_path):
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
-    choice = Choice({"MPC": Row(4, 1.0, 0.1, 40, 40.0, True)})
+    Choice(table((4, 1.0, 0.1, 40, True), names=["MPC"])).write(tmp_path)
     with pytest.raises(QPError, match=r"starts\.csv: got 'MPC', expected one of MPC of the"):
-        chosen_before(cfg, physics, collect_log(cfg, physics), choice)
+        chosen_before(cfg, physics, collect_log(cfg, physics), tmp_path)

@@ -14,7 +14,7 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc.envs import GymnasiumPlant, Plant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop, plant_loop
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.evaluation import UNPAIRED, Evaluation, rival_costs
+from torch_qpmpc.experiment.evaluation import UNPAIRED, Evaluation
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, Policy, zero_action
 from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics, register
 
@@ -37,6 +37,10 @@ def test_the_summary_has_each_J_the_gap_and_the_rivals():
     assert found.lines() == {"start": start, "true model": true}
 
 
+def rivals_of(cfg, plant):
+    return Evaluation.before(cfg, plant, make_mpc(cfg, plant)).rivals
+
+
 def proportional(gain: float) -> Policy:
     return lambda p: gain * (1.5 - p[:, -1:])
 
@@ -56,16 +60,16 @@ STORE = ("task=store", "task.eval_steps=6")
 )
 def test_all_rivals_are_evaluated_or_those_that_are_named(rivals, chosen, names):
     cfg = make_config(*STORE, f"rivals={chosen}")
-    assert list(rival_costs(cfg, make_physics(cfg))) == names
+    assert list(rivals_of(cfg, make_physics(cfg))) == names
 
 
 def test_zero_action_is_the_action_within_the_bounds_nearest_to_zero():
-    settings = ("task=gymnasium", "task.id=Pendulum-v1", "noise=none", "rivals=true")
+    settings = ("task=pendulum", "noise=none", "rivals=true")
     cfg = make_config(*SMALL, *settings)
     plant = make_physics(cfg)
     assert isinstance(plant, GymnasiumPlant)
     loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=10)
-    assert rival_costs(cfg, plant) == {ZERO_ACTION: loop.J}
+    assert rivals_of(cfg, plant) == {ZERO_ACTION: loop.J}
     plant.lb_a = plant.lb_a + 3.0
     assert zero_action(plant)(torch.zeros(2, 3)).tolist() == [[1.0], [1.0]]
 
@@ -90,5 +94,5 @@ def test_rivals_have_the_disturbances_of_the_learned_policy(rivals):
     plant = make_physics(cfg)
     assert isinstance(plant, Plant)
     loop = plant_loop(proportional(5.0), plant, steps=6, seed=4)
-    assert rival_costs(cfg, plant) == {"strong": loop.J}
+    assert rivals_of(cfg, plant) == {"strong": loop.J}
     assert torch.equal(evaluate(cfg, proportional(5.0), plant).costs, loop.costs)

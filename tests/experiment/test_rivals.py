@@ -10,8 +10,8 @@ from tests.runs import make_config
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment import rivals
-from torch_qpmpc.experiment.evaluation import rival_costs
-from torch_qpmpc.experiment.tasks import gros_zanon, make_physics, point_mass
+from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.tasks import gros_zanon, make_mpc, make_physics, point_mass
 from torch_qpmpc.mpc.tightening import tighten
 
 
@@ -31,7 +31,8 @@ def covariances(monkeypatch) -> list[torch.Tensor]:
 @pytest.mark.parametrize("task", ["point_mass", "gros_zanon"])
 def test_each_task_has_the_rival(task):
     cfg = make_config(f"task={task}", "rivals=[tightened]", "task.eval_steps=2")
-    assert list(rival_costs(cfg, make_physics(cfg))) == ["tightened"]
+    plant = make_physics(cfg)
+    assert list(Evaluation.before(cfg, plant, make_mpc(cfg, plant)).rivals) == ["tightened"]
 
 
 def test_tightening_halves_the_cost_next_to_a_bound(monkeypatch):

@@ -31,12 +31,10 @@ from torch_qpmpc.experiment.tasks import (
     make_mpc,
     make_physics,
     make_true_mpc,
-    named_code,
-    named_task,
     register,
-    resume_arguments,
     run_code,
 )
+from torch_qpmpc.experiment.tasks.code import named_code, named_task, resume_arguments
 from torch_qpmpc.mpc.banded import banded_matrix
 
 
@@ -150,11 +148,11 @@ def test_the_true_scheme_has_the_mean_of_the_noise():
         (("task.A=null",), r"^task\.A: got null, expected the rows of a matrix \(3, 3\)"),
         (
             ("task.id=MountainCarContinuous-v0",),
-            r", expected task\.A of shape \(2, 2\), ",
+            r"A, B: got shapes \(3, 3\) and \(3, 1\), expected \(2, 2\) and \(2, 1\)",
         ),
         (
             ("start=data", "task.stage_weight=[[1]]", "task.A=null", "task.B=null"),
-            r"with task\.stage_weight of shape \(1, 1\), expected task\.stage_weight of shape ",
+            r"stage_weight: got shape \(1, 1\), expected shape \(4, 4\)",
         ),
     ],
 )

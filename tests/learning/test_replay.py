@@ -78,7 +78,7 @@ def test_windows_never_cross_episodes(steps, max_steps, rows):
     wrapped = False
     for batch in batches(60 // steps, steps, max_steps):
         replay.extend(batch)
-        if replay.has_windows():
+        if replay.windows.can_sample():
             index = check_windows(replay)
             wrapped |= bool((index.diff(dim=1) < 0).any())
     assert len(replay) == rows * ENVS
@@ -198,15 +198,3 @@ def test_a_flattened_batch_is_an_error():
 def test_bad_capacity_is_an_error(capacity):
     with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):
         Replay(capacity, ENVS, 32, N, 5)
-
-
-def test_sampling_windows_too_early_is_an_error():
-    replay = filled([], rows=40)
-    match = "replay: got no window in {} transitions, expected 4 consecutive transitions"
-    with pytest.raises(QPError, match=match.format(0)):
-        replay.sample_tau()
-    for batch in batches(2, 1, max_steps=50):
-        replay.extend(batch)
-    assert not replay.has_windows()
-    with pytest.raises(QPError, match=match.format(16)):
-        replay.sample_tau()

@@ -24,7 +24,6 @@ from torch_qpmpc.analysis.structure import (
     predictions,
 )
 from torch_qpmpc.checks import check_kind, check_tensor, check_whole
-from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import without_gradients
@@ -40,36 +39,29 @@ COLOURS = {"start": "tab:red", "learned": "tab:blue", "true model": "tab:green"}
 
 
 def draw_matrix(axes: Axes, C: Tensor, mpc: QPMPC, title: str) -> None:
-    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages.
-
-    A dashed line ends the preview.
-    """
-    image = axes.imshow(
-        C.detach().cpu().numpy(),
-        cmap="RdBu_r",
-        norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
-        interpolation="nearest",
-        aspect="equal" if mpc.n_p == mpc.n_x else "auto",
-    )
+    """Draw a constraint matrix as a heatmap, logarithmic beyond 0.01, with lines between stages."""
     layout = mpc.layout
+    _draw_entries(axes, C, layout, title, aspect="auto" if layout.n_d else "equal")
     for k in range(1, mpc.horizon):
         axes.axhline(k * mpc.n_x - 0.5, color="0.85", linewidth=0.4)
     previews = range(mpc.n_d, layout.n_preview, mpc.n_d) if mpc.n_d else ()
     stages = range(layout.n_preview or layout.n, layout.n_z, layout.n)
     for column in (*previews, *stages):
         axes.axvline(column - 0.5, color="0.85", linewidth=0.4)
-    _draw_end(axes, layout)
-    axes.set_title(title)
     plan = (layout.n_preview, layout.n, range(mpc.horizon + 1), "x")
     columns = _columns(layout, layout.n_z, plan)
     axes.set_xticks(list(columns), list(columns.values()))
     rows = range(0, mpc.horizon, max(1, mpc.horizon // 5))
     axes.set_yticks([k * mpc.n_x for k in rows], [f"$k={k}$" for k in rows])
+
+
+def _draw_entries(axes: Axes, matrix: Tensor, layout: Layout, title: str, aspect: Any) -> None:
+    """Draw the entries as a heatmap, and the end of the preview as a dashed line."""
+    scale = SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1)
+    entries, style = matrix.detach().cpu().numpy(), {"cmap": "RdBu_r", "norm": scale}
+    image = axes.imshow(entries, interpolation="nearest", aspect=aspect, **style)
     axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, -0.01, 0, 0.01, 0.1, 1])
-
-
-def _draw_end(axes: Axes, layout: Layout) -> None:
-    """Draw the end of the preview."""
+    axes.set_title(title)
     if layout.n_d:
         axes.axvline(layout.n_preview - 0.5, color="black", linewidth=0.8, linestyle="--")
 
@@ -92,22 +84,12 @@ def _columns(layout: Layout, width: int, *plan: tuple[int, int, range, str]) -> 
 
 
 def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
-    """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap.
-
-    A dashed line ends the preview.
-    """
+    """Draw ``[Phi, Gamma]``, the effect of p and each u_j on each x_k, as a heatmap."""
     layout = form.layout
     N, n_x, n_u, n_p = layout.horizon, layout.n_x, layout.n_u, layout.n_p
     entries = torch.cat((form.Phi, form.Gamma), dim=-1)
-    image = axes.imshow(
-        entries.numpy(),
-        cmap="RdBu_r",
-        norm=SymLogNorm(linthresh=1e-2, vmin=-1, vmax=1),
-        interpolation="nearest",
-        aspect="auto",
-    )
+    _draw_entries(axes, entries, layout, title, aspect="auto")
     axes.axvline(n_p - 0.5, color="black", linewidth=0.8)
-    _draw_end(axes, layout)
     for k in range(1, N):
         axes.axhline(k * n_x - 0.5, color="0.85", linewidth=0.4)
         axes.axvline(n_p + k * n_u - 0.5, color="0.85", linewidth=0.4)
@@ -117,13 +99,12 @@ def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
                 edge, row = first + k * width - 0.5, k * n_x - 0.5
                 axes.plot([edge, edge], [row - n_x, row], color="black", linewidth=0.8)
                 axes.plot([edge, edge + width], [row, row], color="black", linewidth=0.8)
-    axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5), title=title)
+    axes.set(xlim=(-0.5, entries.shape[1] - 0.5), ylim=(len(entries) - 0.5, -0.5))
     shown = range(0, N, max(1, N // 5))
     x_0, actions = (layout.n_preview, n_x, range(1), "x"), (n_p, n_u, range(N), "u")
     columns = _columns(layout, entries.shape[1], x_0, actions)
     axes.set_xticks(list(columns), list(columns.values()))
     axes.set_yticks([k * n_x for k in shown], [f"$x_{{{k + 1}}}$" for k in shown])
-    axes.figure.colorbar(image, ax=axes, shrink=0.7, ticks=[-1, -0.1, 0, 0.1, 1])
 
 
 def canonical_figure(mpc: QPMPC) -> Figure:
@@ -281,23 +262,12 @@ def episode_figure(
     check_tensor("y", y, length, "n_y", batched=False)
     check_tensor("u", u, length - 1, "n_u", batched=False)
     n_y, n_u = y.shape[-1], u.shape[-1]
-    names = [*_names("outputs", outputs, "y", n_y), *_names("actions", actions, "u", n_u)]
-    if references is not None:
-        check_tensor("references", references, length, n_y, batched=False)
-    bounds = (
-        []
-        if band is None
-        else [
-            _bound(name, side, length, n_y)
-            for name, side in zip(("lower", "upper"), band, strict=True)
-        ]
-    )
+    names = [
+        *(outputs or [f"$y_{{{i + 1}}}$" for i in range(n_y)]),
+        *(actions or [f"$u_{{{i + 1}}}$" for i in range(n_u)]),
+    ]
+    bounds = [side.masked_fill(side.isinf(), torch.nan).expand(length, n_y) for side in band or ()]
     signals = signals or {}
-    for name, signal in signals.items():
-        check_tensor(f"signals[{name!r}]", signal, "T", batched=False)
-        if len(signal) < length - 1:
-            got, want = f"shape {tuple(signal.shape)}", f"at least {length - 1} entries"
-            raise QPError.expected(f"signals[{name!r}]", got, want)
     figure = Figure(figsize=(6.5, 1.7 * (len(names) + len(signals))), layout="constrained")
     panels = figure.subplots(len(names) + len(signals), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(panels, [*names, *signals], strict=True):
@@ -326,23 +296,6 @@ def episode_figure(
             axes.set_ylim(low - 0.5, high + 0.5)
     panels[-1].set(xlabel=xlabel, xlim=(times[0].item(), times[-1].item()))
     return figure
-
-
-def _names(what: str, names: Sequence[str] | None, letter: str, count: int) -> Sequence[str]:
-    if names is None:
-        return [f"${letter}_{{{i + 1}}}$" for i in range(count)]
-    if isinstance(names, str) or len(names) != count:
-        raise QPError.expected(what, repr(names), f"{count} names")
-    return names
-
-
-def _bound(name: str, bound: Tensor, length: int, n_y: int) -> Tensor:
-    """Return one side of the band, ``(T + 1, n_y)``, nan for none."""
-    check_tensor(f"band, {name}", bound, n_y)
-    if bound.shape[:-1] not in ((), (length,)):
-        got, want = f"shape {tuple(bound.shape)}", f"shape ({n_y},) or ({length}, {n_y})"
-        raise QPError.expected(f"band, {name}", got, want)
-    return bound.masked_fill(bound.isinf(), torch.nan).expand(length, n_y)
 
 
 def _held(values: Tensor) -> Tensor:

@@ -157,14 +157,8 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
 
     From each row block of ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted. For an
     MPC scheme only the band remains, C_0. In general, a row's other entries are what x_k, u_k and
-    d_k do not explain.
-
-    Args:
-        form: the prediction form of the constraints.
-        A: ``(N, n_x, n_x)``, such as ``stage_models(form).A``.
-
-    Returns:
-        C ``(N n_x, n_z)`` and b ``(N n_x,)``.
+    d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is C
+    ``(N n_x, n_z)`` and b ``(N n_x,)``.
 
     Raises:
         QPError: if ``form`` has batch dimensions, or the shape of A does not fit.
@@ -345,19 +339,9 @@ def _without_offset(maps: Tensor) -> Tensor:
 def second_moment(s: Tensor, a: Tensor, d: Tensor | None = None) -> Tensor:
     """Return E[v v'] ``(n_v, n_v)`` of v = (s, a, d, 1) over samples ``(*batch, n)``.
 
-    Args:
-        s, a: states and actions.
-        d: the known signals d_k; None without a preview.
-
-    Raises:
-        QPError: if s, a and d differ in their numbers of samples, or have none.
+    d are the known signals d_k; None without a preview.
     """
-    check_tensor("s", s, "n_x")
-    check_tensor("a", a, "n_u")
-    d = a[..., :0] if d is None else check_tensor("d", d, "n_d")
-    if not (s.shape[:-1] == a.shape[:-1] == d.shape[:-1] and s.shape[:-1].numel()):
-        got = f"shapes {tuple(s.shape)}, {tuple(a.shape)} and {tuple(d.shape)}"
-        raise QPError.expected("s, a, d", got, "the same number of samples, at least one")
+    d = a[..., :0] if d is None else d
     v = torch.cat((s, a, d, torch.ones_like(a[..., :1])), dim=-1)
     v = v.reshape(-1, v.shape[-1])
     return v.mT @ v / len(v)

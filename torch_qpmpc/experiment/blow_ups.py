@@ -12,16 +12,11 @@ GROWTH = 1e6
 
 
 def without_blow_ups(log: TensorDictBase) -> tuple[TensorDictBase, int]:
-    """Mask each episode from its first diverging step on.
+    """Mask each episode of a log ``(T,)`` or ``(episodes, T)`` from its first diverging step on.
 
     An episode blows up where an observation or a reward is not finite, or an observation is larger
-    than 1e6 times the largest of the log's first transitions.
-
-    Args:
-        log: logged steps, ``(T,)`` or ``(episodes, T)``, as in `as_log`.
-
-    Returns:
-        The log, with an entry ``mask`` if steps are masked, and the number of these episodes.
+    than 1e6 times the largest of the log's first transitions. Return the log, with an entry
+    ``mask`` if steps are masked, and the number of these episodes.
     """
     rows = log if log.batch_dims == 2 else log.unsqueeze(0)
     size = torch.maximum(*(rows[key].double().abs().amax(-1) for key in ("observation", NEXT)))
@@ -32,12 +27,10 @@ def without_blow_ups(log: TensorDictBase) -> tuple[TensorDictBase, int]:
     if not (bad & valid_steps(rows)).any():
         return log, 0
     done = rows.get(("next", "done"), torch.zeros_like(bad)).reshape(bad.shape)
-    cut, over, episodes = torch.zeros_like(bad), bad.new_zeros(len(bad)), 0
-    for k in range(bad.shape[1]):
-        episodes += (bad[:, k] & ~over).sum().item()
-        over = over | bad[:, k]
-        cut[:, k] = over
-        over = over & ~done[:, k]
+    new = torch.nn.functional.pad(done, (1, 0))[:, :-1]
+    first = torch.where(new, torch.arange(bad.shape[1]), 0).cummax(1).values
+    count = bad.cumsum(1)
+    count = count - (count - bad.long()).gather(1, first)  # bad steps of this episode so far
     masked = log.clone(recurse=False)
-    masked["mask"] = (valid_steps(rows) & ~cut).reshape(log.shape)
-    return masked, int(episodes)
+    masked["mask"] = (valid_steps(rows) & (count == 0)).reshape(log.shape)
+    return masked, int((bad & (count == 1)).sum())

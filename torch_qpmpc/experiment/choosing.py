@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
+import pandas as pd
 import torch
 from omegaconf import DictConfig
 from scipy.special import stdtrit
@@ -14,12 +15,12 @@ from tensordict import TensorDictBase, pad
 from torch import Tensor
 from tqdm import tqdm
 
-from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.costs import cost_text
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
-from torch_qpmpc.experiment.tasks.choice import Choice, Row
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
+from torch_qpmpc.files import damaged, write_whole
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import identify_blended
 from torch_qpmpc.mpc.log import valid_steps
@@ -37,6 +38,70 @@ BLENDED_SHARE = 0.8
 ESTIMATE, OUTPUTS, BLENDED = "MPC of the estimate", "MPC of the outputs", "blended models"
 #: The end of the names of starts that are identified from the first log alone.
 FIRST = ", first log"
+#: The table in a run's folder.
+STARTS = "starts.csv"
+NOTHING = (
+    "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
+    "of these logs controls the plant: pass a log about the states where the controller is to work "
+    "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
+    "plant's own cost (task.stage_weight), or a theta from a network: 'Scheduled and nonlinear "
+    "plants' in the guides."
+)
+
+
+class Choice(NamedTuple):
+    """The starts by name, best first; one of them is ``chosen``.
+
+    ``J`` is the mean cost of ``episodes`` with its standard ``error``, and ``transitions`` at most
+    the number of their steps. ``print`` shows the table.
+    """
+
+    table: pd.DataFrame
+
+    @property
+    def name(self) -> str:
+        """The name of the chosen start."""
+        chosen: Any = self.table["chosen"]
+        return chosen[chosen].index.item()
+
+    @property
+    def scheme(self) -> str:
+        """The name of the best start that is not zero action, with which learning begins."""
+        return next(name for name in self.table.index if name != ZERO_ACTION)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The entries of summary.json."""
+        total: Any = self.table["transitions"].sum()
+        return {"start": self.name, "start_transitions": int(total)}
+
+    def __str__(self) -> str:
+        words: Any = dict.fromkeys(("J", "error"), cost_text)
+        rows = self.table.to_string(columns=["episodes", *words], formatters=words)
+        count = f"{self.summary['start_transitions']:,} transitions beside the logs'"
+        lines = [rows, f"Chosen by at most {count}: {self.name}"]
+        return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
+
+    def of(self, start: Start, physics: AnyPlant) -> Start:
+        """Return the start of `scheme`, which holds zero action if that is chosen."""
+        action = zero_action(physics)(physics.lb_a[None])[0]
+        return start._replace(held=action if self.name == ZERO_ACTION else None, choice=self)
+
+    def write(self, folder: Path) -> None:
+        """Write the table into a run's folder."""
+        write_whole(folder / STARTS, self.table.to_csv(index_label="start").encode())
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read the table of a run; raise `QPError` if it is missing or damaged."""
+        try:
+            exact = dict.fromkeys(("J", "error"), float)  # pandas before 3.1 rounds
+            choice = cls(pd.read_csv(folder / STARTS, index_col="start", converters=exact))
+            _ = choice.name, choice.scheme
+        except Exception as error:  # damaged files raise errors of any type
+            want = "the table of starts that a run wrote"
+            raise damaged(folder / STARTS, error, want, "Start a new run.") from error
+        return choice
 
 
 def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
@@ -51,17 +116,19 @@ def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]
     estimate, N = identified_start(cfg, physics, log), cfg.task.horizon
     outputs = estimate if not estimate.order else identified_start(cfg, physics, log, order=0)
     regulated = estimate.cost is not None and cfg.task.hessian != "diagonal"
-    named = {ESTIMATE: estimate} if estimate.order else {}
-    named = {
-        name: start._replace(riccati=regulated)
-        for name, start in (named | {OUTPUTS: outputs}).items()
-    }
+    named = ({ESTIMATE: estimate} if estimate.order else {}) | {OUTPUTS: outputs}
+    named = {name: start._replace(riccati=regulated) for name, start in named.items()}
     if not outputs.layout.n_d and cfg.export is None and cfg.constraint.si is None:
         blended = identify_blended(outputs.log, 2 * N)
         unexplained = {count: 1 - R2 for count, R2 in blended.R2.items()}
         if min(unexplained.values()) < BLENDED_SHARE * unexplained[1]:
             named[BLENDED] = outputs._replace(horizon=2 * N, blended=blended)
-    return {name: _solvable(cfg, physics, start) for name, start in named.items()}
+    for name, start in named.items():
+        try:
+            make_mpc(cfg, start.plant(physics), start)
+        except QPError:  # the model and the cost have no regulator
+            named[name] = start._replace(riccati=False)
+    return named
 
 
 def choose(
@@ -78,54 +145,65 @@ def choose(
     ``task.start_episodes`` in all, as zero action has. The best one is chosen if it costs less than
     zero action by a one-sided paired t-test of 95 %; if not, zero action is.
     """
-    rows, costs = {}, {}
-    named = {f"{name}{FIRST}": start for name, start in candidates(cfg, physics, log).items()}
+    costs: dict[str, Tensor] = {}
+    few, steps = min(FEW, cfg.task.start_episodes), 0
+
+    def J(name: str) -> float:
+        return costs[name].mean().item()
+
     with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
 
-        def run(name: str, count: int) -> None:
-            bar.set_postfix_str(name)
-            done = costs.get(name, torch.zeros(0, dtype=torch.float64))
-            loop = _loop(cfg, physics, named[name], len(done), count)
-            costs[name] = torch.cat((done, loop.costs.sum(0).nan_to_num(torch.inf, torch.inf)))
-            lasted = float(loop.costs.numel() if loop.lengths is None else loop.lengths.sum())
-            old = rows.get(name, Row())
-            J, steps = costs[name], old.transitions + loop.costs.numel()
-            rows[name] = Row(len(J), J.mean().item(), _error(J), steps, old.lasted + lasted)
-            bar.update()
+        def run(names: Iterable[str], count: int) -> None:
+            nonlocal steps
+            for name in names:
+                bar.set_postfix_str(name)
+                done = costs.get(name, torch.zeros(0, dtype=torch.float64))
+                if len(done) == count:
+                    continue
+                plant = named[name].plant(physics)
+                if name == ZERO_ACTION:
+                    policy = zero_action(plant)
+                else:
+                    policy = warm_policy(make_mpc(cfg, plant, named[name]))
+                options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
+                options |= {"starts": count - len(done), "seed": APART + cfg.seed + len(done)}
+                loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
+                costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
+                steps = len(loop)
+                bar.update()
 
-        few = min(FEW, cfg.task.start_episodes)
-        for name in named:
-            run(name, few)
-        best = min(named, key=lambda name: rows[name].J)
-        log = below(log, explored(named[best]))
+        named = {f"{name}{FIRST}": start for name, start in candidates(cfg, physics, log).items()}
+        run(named, few)
+        log = below(log, explored(named[min(named, key=J)]))
         second = candidates(cfg, physics, log)
         named |= second
-        for name in second:
-            run(name, few)
-        finalists = sorted(named, key=lambda name: rows[name].J)[:2]
-        named[ZERO_ACTION] = named[finalists[0]]._replace(held=_zero(physics))
-        for name in (*finalists, ZERO_ACTION):
-            if name == ZERO_ACTION or few < cfg.task.start_episodes:
-                run(name, cfg.task.start_episodes)
-    best = min(finalists, key=lambda name: rows[name].J)
-    chosen = best if _is_less(costs[best] - costs[ZERO_ACTION]) else ZERO_ACTION
-    choice = Choice({name: row._replace(chosen=name == chosen) for name, row in rows.items()})
-    return named[best]._replace(held=named[chosen].held, choice=choice), log
+        run(second, few)
+        finalists = sorted(named, key=J)[:2]
+        named[ZERO_ACTION] = named[finalists[0]]
+        run((*finalists, ZERO_ACTION), cfg.task.start_episodes)
+    best = min(finalists, key=J)
+    gain = costs[best] - costs[ZERO_ACTION]
+    bound = gain.mean() + float(stdtrit(len(gain) - 1, CONFIDENCE)) * _error(gain)
+    chosen = best if gain.mean() == -math.inf or bound < 0 else ZERO_ACTION
+    rows = [(len(x), J(name), _error(x), steps * len(x)) for name, x in costs.items()]
+    table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions"])
+    table["chosen"] = table.index == chosen
+    choice = Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))
+    return choice.of(named[best], physics), log
 
 
-def chosen_before(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase, choice: Choice) -> Start:
-    """Return the start that a run has chosen from its logs.
+def chosen_before(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase, folder: Path) -> Start:
+    """Return the start that the run in ``folder`` has chosen from its logs.
 
     Raises:
-        QPError: the logs have no such start.
+        QPError: the table is missing or damaged, or the logs have no such start.
     """
+    choice = Choice.read(folder)
     first = choice.scheme.endswith(FIRST)
     named = candidates(cfg, physics, log[: -cfg.num_envs] if first else log)
     if (start := named.get(choice.scheme.removesuffix(FIRST))) is None:
-        raise QPError.expected("starts.csv", f"{choice.scheme!r}", f"one of {', '.join(named)}")
-    return start._replace(
-        held=_zero(physics) if choice.name == ZERO_ACTION else None, choice=choice
-    )
+        raise QPError.expected(STARTS, f"{choice.scheme!r}", f"one of {', '.join(named)}")
+    return choice.of(start, physics)
 
 
 def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
@@ -140,36 +218,6 @@ def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
     common = set.intersection(*({*log.keys(True, True)} for log in logs))
     both: Any = torch.cat([log.select(*common) for log in logs])
     return both
-
-
-def _zero(physics: AnyPlant) -> Tensor:
-    return zero_action(physics)(physics.lb_a[None])[0]
-
-
-def _solvable(cfg: DictConfig, physics: AnyPlant, start: Start) -> Start:
-    """Return the start, without the regulator's cost of x_N if its model and cost have none."""
-    with suppress(QPError):
-        make_mpc(cfg, start.plant(physics), start)
-        return start
-    return start._replace(riccati=False)
-
-
-def _loop(cfg: DictConfig, physics: AnyPlant, start: Start, done: int, count: int) -> ClosedLoop:
-    """Run a start's next ``count - done`` episodes."""
-    plant, held = start.plant(physics), start.held
-    if held is None:
-        policy = warm_policy(make_mpc(cfg, plant, start))
-    else:
-        policy = lambda s: held.expand(len(s), -1)  # noqa: E731
-    options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
-    options |= {"starts": count - done, "seed": APART + cfg.seed + done}
-    return find_task(cfg.task).closed_loop(policy, plant, **options)
-
-
-def _is_less(differences: Tensor) -> bool:
-    """Return True if the mean of ``differences`` is negative, by a one-sided t-test."""
-    mean, t = differences.mean().item(), float(stdtrit(len(differences) - 1, CONFIDENCE))
-    return mean == -math.inf or mean + t * _error(differences) < 0
 
 
 def _error(costs: Tensor) -> float:

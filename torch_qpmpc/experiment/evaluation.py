@@ -9,6 +9,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from omegaconf import DictConfig
@@ -27,8 +28,6 @@ from torch_qpmpc.experiment.tasks.identified import nominal_mpcs
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
 
-#: Functions that make a policy, by name.
-Policies = dict[str, Callable[[], Policy]]
 UNPAIRED = (
     "Two episodes of {id!r} with one seed and the same actions differ: policies are compared on "
     "different episodes, and the gate's pairs are not pairs. Draw all of the environment's random "
@@ -65,11 +64,18 @@ class Evaluation:
         """
         if isinstance(physics, GymnasiumPlant) and not physics.is_reproducible():
             warnings.warn(UNPAIRED.format(id=physics.id), UserWarning, stacklevel=2)
-        policies: Policies = {"start": lambda: warm_policy(mpc)}
+        policies: dict[str, Callable[[], Policy]] = {"start": lambda: warm_policy(mpc)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:
             policies["true model"] = lambda: warm_policy(true_mpc)
-        rivals = _rivals(cfg, physics)
-        loops = _run(cfg, physics, policies | rivals, quiet)
+        rivals = find_task(cfg.task).rivals
+        if cfg.rivals is not True:
+            rivals = {name: make for name, make in rivals.items() if name in (cfg.rivals or ())}
+        policies |= {name: partial(make, physics) for name, make in rivals.items()}
+        loops = {}
+        with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet or None) as bar:
+            for name, make in bar:
+                bar.set_postfix_str(name)
+                loops[name] = evaluate(cfg, make(), physics)
         first = loops["start"]  # of which a finite state has a cost, whatever comes later
         check_rewards(replace(first, costs=first.costs[:1]), physics)
         costs = {name: loops.pop(name).J for name in rivals}
@@ -131,28 +137,3 @@ def check_rewards(loop: ClosedLoop, physics: AnyPlant) -> None:
         remedy = f"The plant ends episodes by {raised[0]}." if raised else remedy
         got = f"NaN in {int(loop.costs.isnan().sum())} of {loop.costs.numel()} evaluated steps"
         raise QPError.expected("reward", got, "numbers", remedy)
-
-
-def rival_costs(cfg: DictConfig, physics: AnyPlant) -> dict[str, float]:
-    """Return J of each rival of the task that ``cfg.rivals`` chooses."""
-    loops = _run(cfg, physics, _rivals(cfg, physics), quiet=True)
-    return {name: loop.J for name, loop in loops.items()}
-
-
-def _rivals(cfg: DictConfig, physics: AnyPlant) -> Policies:
-    rivals, chosen = find_task(cfg.task).rivals, cfg.rivals
-    if isinstance(chosen, bool):
-        chosen = rivals if chosen else ()
-    chosen = [name for name in chosen if name != IDENTIFICATION]
-    return {name: lambda make=rivals[name]: make(physics) for name in chosen}
-
-
-def _run(
-    cfg: DictConfig, physics: AnyPlant, policies: Policies, quiet: bool
-) -> dict[str, ClosedLoop]:
-    loops = {}
-    with tqdm(policies.items(), "first evaluation", leave=False, disable=quiet or None) as bar:
-        for name, make in bar:
-            bar.set_postfix_str(name)
-            loops[name] = evaluate(cfg, make(), physics)
-    return loops

@@ -36,11 +36,6 @@ class RunGate:
     from it after three rejections in a row. ``gate=plant`` does the same with closed loops that a
     plant can run, as no two of them have the same starts and disturbances.
 
-    Args:
-        cfg: the run's configuration; ``gate`` switches the comparisons on.
-        learner: the learner, whose policy is the candidate.
-        physics: the plant.
-
     Attributes:
         kept: the policy that is evaluated and saved; without a gate, the learner's.
         compared: the number of transitions in closed loops of comparisons.

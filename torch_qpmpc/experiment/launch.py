@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 import signal
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,57 +34,41 @@ LOCK = ".lock"
 OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
 
 
-@dataclass(frozen=True)
-class Launch:
-    """One call of train.py.
+def settled(
+    cfg: DictConfig, folder: str, sweep: bool
+) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
+    """Decide between a new run in ``folder``, one to resume, and a finished one of a ``sweep``.
 
-    Attributes:
-        folder: the run's folder.
-        overrides: the command line's overrides.
-        sweep: True if the run is part of a sweep.
+    Returns:
+        The run's configuration, the state to resume from or None, and the summary of a finished
+        run or None.
+
+    Raises:
+        QPError: the configuration is invalid, or the folder holds another run.
     """
-
-    folder: str
-    overrides: Collection[str]
-    sweep: bool
-
-    def settle(
-        self, cfg: DictConfig
-    ) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
-        """Decide between a new run, one to resume, and a finished one of a sweep.
-
-        Returns:
-            The run's configuration, the state to resume from or None, and the summary of a
-            finished run or None.
-
-        Raises:
-            QPError: the configuration is invalid, or the folder holds another run.
-        """
-        resume, state = cfg.resume, None
-        if resume is None:
-            run_code(cfg.task)
-        else:
-            own = cfg.task.get("file")
-            cfg, state = resumed(resume, self.overrides)
-            run_code({**cfg.task, "file": own})
-        check_config(cfg)
-        if self.sweep:
-            if (summary := finished_run(self.folder, cfg)) is not None:
-                return cfg, None, summary
-            state = stopped_run(self.folder, cfg)
-        elif resume is None:
-            check_fresh(self.folder)
-        else:
-            check_own_folder(resume, self.folder)
-        return cfg, state, None
+    resume, state = cfg.resume, None
+    if resume is None:
+        run_code(cfg.task)
+    else:
+        own = cfg.task.get("file")
+        cfg, state = resumed(resume, HydraConfig.get().overrides.task)
+        run_code({**cfg.task, "file": own})
+    check_config(cfg)
+    if sweep:
+        if (summary := finished_run(folder, cfg)) is not None:
+            return cfg, None, summary
+        state = stopped_run(folder, cfg)
+    elif resume is None:
+        check_fresh(folder)
+    else:
+        check_own_folder(resume, folder)
+    return cfg, state, None
 
 
 def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
     """Raise `QPError` for an unknown key, for which Hydra advises a +, or no run to resume.
 
-    Args:
-        arguments: the command line.
-        configs: the folder of the configuration groups.
+    ``configs`` is the folder of the configuration groups.
     """
     known, groups = [*keys()], {path.name for path in Path(configs).iterdir() if path.is_dir()}
     for argument in arguments:
@@ -100,22 +83,22 @@ def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
 
 
 @contextmanager
-def launched() -> Iterator[Launch]:
-    """Lock the run's folder, and exit with one sentence on a user's error.
+def launched() -> Iterator[tuple[str, bool]]:
+    """Lock the run's folder, yield it and True in a sweep, and exit with one sentence on an error.
 
     In a sweep the error is raised instead, because an exit would end the other runs.
     """
     hydra = HydraConfig.get()
     sweep = hydra.mode is RunMode.MULTIRUN
-    launch = Launch(hydra.runtime.output_dir, list(hydra.overrides.task), sweep)
+    folder = hydra.runtime.output_dir
     try:
-        with locked(launch.folder, f"hydra.{'sweep' if sweep else 'run'}.dir=FOLDER"):
-            yield launch
+        with locked(folder, f"hydra.{'sweep' if sweep else 'run'}.dir=FOLDER"):
+            yield folder, sweep
     except (QPError, OSError) as error:
         if sweep:
             raise
         if isinstance(error, OSError):
-            error = unwritable(launch.folder, error)
+            error = unwritable(folder, error)
         raise SystemExit(str(error)) from None
 
 

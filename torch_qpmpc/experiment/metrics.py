@@ -24,7 +24,7 @@ from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
-from torch_qpmpc.experiment.tally import Stopwatch, Tally
+from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -38,7 +38,7 @@ def update_metrics(
     terms: Mapping[str, Tensor],
     losses: Scalars,
     tally: Tally,
-    watch: Stopwatch,
+    times: Sequence[float],
     mpc: QPMPC,
     learner: Learner,
 ) -> dict[str, float]:
@@ -50,7 +50,8 @@ def update_metrics(
     metrics |= tally.metrics() | theta_metrics(mpc)
     if learner.deviation is not None:
         metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
-    return metrics | {"time/collect": watch.data, "time/update": watch.total - watch.data}
+    began, collected, ended = times
+    return metrics | {"time/collect": collected - began, "time/update": ended - collected}
 
 
 def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str, Any]:

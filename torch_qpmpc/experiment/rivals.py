@@ -39,13 +39,9 @@ def tightened(plant: LinearSystem, weight: Tensor, W: Tensor, walk: bool = False
     """Make chance-constrained MPC: the true model, and bounds tightened by its noise.
 
     A planned bound then holds with a probability of 95 %, as in `torch_qpmpc.mpc.tightening`, with
-    the linear quadratic regulator as feedback. There is no discount.
-
-    Args:
-        plant: the plant.
-        weight: the stage weight, ``(n_x + n_u, n_x + n_u)``.
-        W: covariance of the noise or, with ``walk``, of its steps, ``(n_x, n_x)``.
-        walk: the noise is a random walk, whose first variance is the mean over an episode.
+    the regulator of the stage ``weight`` as feedback. There is no discount. ``W`` ``(n_x, n_x)`` is
+    the covariance of the noise or, if that is a random ``walk``, of its steps; the walk's first
+    variance is then the mean over an episode.
     """
     A, B, offset = plant.true_model()
     K = -lqr_gain(A, B, weight)

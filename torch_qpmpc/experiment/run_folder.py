@@ -18,7 +18,7 @@ from torchrl.record.loggers import Logger, get_logger
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT
 from torch_qpmpc.experiment.config import settings
-from torch_qpmpc.experiment.tasks import COMMAND
+from torch_qpmpc.experiment.tasks.code import COMMAND
 from torch_qpmpc.files import damaged, write_whole
 
 #: Entries of summary.json that are numbers or, if they are not finite, null.
@@ -29,12 +29,8 @@ NUMBERS += ("canonical_distance",)
 class RunFolder:
     """The output of one run; a context manager, which flushes at its end.
 
-    Scalars go to metrics.csv and to one of TorchRL's loggers, which a resumed run goes on in.
-
-    Args:
-        folder: the folder, created if it does not exist.
-        cfg: the run's configuration.
-        after: the update to resume after, whose earlier rows are kept; None for a new run.
+    Scalars go to metrics.csv and to one of TorchRL's loggers, which a resumed run goes on in. Of
+    that, rows up to the update ``after`` are kept; None begins a new run.
 
     Raises:
         QPError: rows of updates up to ``after`` are missing or damaged.

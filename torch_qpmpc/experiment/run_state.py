@@ -7,7 +7,8 @@ environments cannot be saved and start new episodes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpo
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.tally import Tally
-from torch_qpmpc.experiment.tasks import COMMAND, has_run, named_code, resume_arguments
+from torch_qpmpc.experiment.tasks.code import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import labelled
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
@@ -63,7 +64,7 @@ def snapshot(
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
-        "tally": tally.state(),
+        "tally": tally.state_dict(),
         "rng": torch.get_rng_state(),
     }
 
@@ -81,27 +82,30 @@ def restore(
     Raises:
         QPError: a part does not match the snapshot.
     """
-    with _part("loss_module"):
-        learner.loss_module.load_state_dict(state["loss_module"])
-    with _part("mpc"):
-        mpc.load_state_dict(state["mpc"])
-    with _part("optimizer"):
-        learner.optimizer.load_state_dict(state["optimizer"])
-    with _part("scheduler"):
-        learner.scheduler.last_epoch = int(state["scheduler"]["last_epoch"])
-    with _part("gate"):
-        gate.load_state_dict(state["gate"])
-    with _part("replay"):
-        if state["replay"] is not None:
-            replay.load_state_dict(state["replay"])
-    with _part("collector"):
-        _restore_collector(collector, state["collector"])
-        if state["collector"] is None:
-            replay.end_episodes()
-    with _part("rng"):
-        torch.set_rng_state(state["rng"])
-    with _part("tally"):
-        return Tally.from_state(state["tally"])
+    tally, schedule = Tally(), vars(learner.scheduler)
+    load: dict[str, Callable[[Any], object]] = {
+        "loss_module": learner.loss_module.load_state_dict,
+        "mpc": mpc.load_state_dict,
+        "optimizer": learner.optimizer.load_state_dict,
+        "scheduler": lambda part: schedule.update(last_epoch=int(part["last_epoch"])),
+        "gate": gate.load_state_dict,
+        "replay": replay.load_state_dict,
+        "collector": partial(_restore_collector, collector),
+        "rng": torch.set_rng_state,
+        "tally": tally.load_state_dict,
+    }
+    for name, function in load.items():
+        try:
+            if state[name] is not None:
+                function(state[name])
+        except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+            reason = str(error).strip().partition("\n")[0]
+            got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
+            remedy = "Try the previous checkpoint: resume=FOLDER/checkpoint-previous.pt."
+            raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
+    if state["collector"] is None:
+        replay.end_episodes()
+    return tally
 
 
 def check_state(state: Any, cfg: DictConfig) -> None:
@@ -124,10 +128,8 @@ def check_state(state: Any, cfg: DictConfig) -> None:
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
     """Load a stopped run's configuration and last state, or None before its first checkpoint.
 
-    Args:
-        path: the run's folder, or one of its checkpoints.
-        overrides: the command line's overrides: ``resume=..``, and the code that the run needs, as
-            in ``task.file=FILE`` or ``task=gymnasium task.id=MODULE:ID``.
+    ``path`` is the run's folder or one of its checkpoints. Beside it, the command line's
+    ``overrides`` name the code that the run needs, as in ``task.file=FILE``.
 
     Raises:
         QPError: there is no stopped run, its state is damaged or another run's, its configuration
@@ -232,17 +234,6 @@ def folder_of(resume: str | None, fresh: str) -> str:
     return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
 
 
-@contextlib.contextmanager
-def _part(name: str) -> Iterator[None]:
-    try:
-        yield
-    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-        reason = str(error).strip().partition("\n")[0]
-        got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
-        remedy = "Try the previous checkpoint: resume=FOLDER/checkpoint-previous.pt."
-        raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
-
-
 def _collector_state(collector: Collector) -> dict[str, Any] | None:
     if (env := _saved_env(collector)) is None:
         return None
@@ -262,9 +253,7 @@ def _saved_env(collector: Collector) -> VectorisedEnv | None:
     return env if isinstance(env, VectorisedEnv) else None
 
 
-def _restore_collector(collector: Collector, state: dict[str, Any] | None) -> None:
-    if state is None:
-        return
+def _restore_collector(collector: Collector, state: dict[str, Any]) -> None:
     env = _saved_env(collector)
     assert env is not None
     episodes = TensorDict(state["episodes"], batch_size=collector._carrier.batch_size)

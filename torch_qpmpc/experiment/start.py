@@ -18,7 +18,6 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.choosing import choose, chosen_before
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
-from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
 from torch_qpmpc.learning.operators import warm_policy
@@ -42,14 +41,8 @@ class Exploration(nn.Module):
     """Random actions that stay constant for a random number of steps.
 
     At each step, each entry of each episode's action keeps its level or, with probability
-    1 / ``hold``, gets a new one: a uniform level within the bounds or, if ``binary``, one of the
-    bounds (a pseudo-random binary signal).
-
-    Args:
-        low, high: the bounds ``(n_u,)``, which must be finite.
-        hold: the mean number of steps between changes.
-        binary: choose among the bounds.
-        seed: seed of the levels.
+    1 / ``hold``, gets a new one: a uniform level within the bounds ``(n_u,)`` or, if ``binary``,
+    one of the bounds (a pseudo-random binary signal).
 
     Raises:
         QPError: a bound is infinite.
@@ -81,24 +74,13 @@ class Exploration(nn.Module):
 def make_start(
     cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
 ) -> Start | None:
-    """Identify the start of a run from a log of the plant, which the run's folder keeps.
+    """Identify the start of a run from a log of the plant; None with ``start=model``.
 
-    With ``task.start_episodes`` closed loops choose it, a second log is below the first one, and
-    the folder gets the table of the choice.
-
-    Args:
-        cfg: the run's configuration.
-        physics: the plant.
-        folder: the run's folder.
-        written: read the log that the run has written there before.
-        quiet: do not print the report of the prediction errors and the fitted cost.
-
-    Returns:
-        The start; None with ``start=model``.
+    With ``task.start_episodes`` closed loops choose it. The run's folder keeps the log and the
+    table of the choice, which are read there if the run has ``written`` them before.
 
     Raises:
-        QPError: the log or the table of starts cannot be read, the log is not identified, or the
-            plant cannot be explored.
+        QPError: a file cannot be read, the log is not identified, or the plant not explored.
     """
     if cfg.start.name != "data":
         return None
@@ -109,17 +91,12 @@ def make_start(
         log = stored_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
-    chosen = bool(cfg.task.get("start_episodes"))
-    choice = Choice.read(path.parent) if written else None
-    if written and chosen and choice is None:
-        want = "the table that the run wrote"
-        raise QPError.expected("starts.csv", "no file", want, "Start a new run.")
-    if choice is not None:
-        start = chosen_before(cfg, physics, log, choice)
-    elif chosen:
-        start, log = choose(cfg, physics, log, partial(collect_log, cfg, physics), quiet)
-    else:
+    if not cfg.task.get("start_episodes"):
         start = identified_start(cfg, physics, log)
+    elif written:
+        start = chosen_before(cfg, physics, log, path.parent)
+    else:
+        start, log = choose(cfg, physics, log, partial(collect_log, cfg, physics), quiet)
     if not written:
         buffer = io.BytesIO()
         torch.save(log.to_dict(), buffer)

@@ -6,26 +6,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import Any, Self
+from typing import Any
 
 from numba.core.event import install_timer
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_qpmpc.qp.pipeline.solve import SolveLog
-
-
-@dataclass
-class Stopwatch:
-    """The seconds of one update: ``data`` of collection, and ``total``."""
-
-    began: float
-    data: float = 0.0
-    total: float = 0.0
-
-    def collected(self) -> None:
-        """Mark the end of the collection."""
-        self.data = time.perf_counter() - self.began
 
 
 @dataclass
@@ -48,28 +35,26 @@ class Tally:
     unsolved: int = 0
     seconds: float = 0.0
 
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> Self:
-        """Restore a tally from `state`."""
-        parts: dict[str, Any] = state | {"qps": SolveLog(**state["qps"])}
-        return cls(**parts)
-
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Return the tally as plain numbers, for a checkpoint."""
         return asdict(self)
 
-    @contextmanager
-    def timed(self) -> Iterator[Stopwatch]:
-        """Count an update's QPs and measure its time."""
-        watch = Stopwatch(time.perf_counter())
-        with self.qps, install_timer("numba:compile", self._subtract):
-            yield watch
-        watch.total = time.perf_counter() - watch.began
-        self.seconds += watch.total
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load a `state_dict`."""
+        vars(self).update(state, qps=SolveLog(**state["qps"]))
 
-    def _subtract(self, seconds: float) -> None:
-        """Subtract the time of a compilation, which `timed` includes."""
-        self.seconds -= seconds
+    @contextmanager
+    def timed(self) -> Iterator[list[float]]:
+        """Count an update's QPs, and list its times: the begin, those that are added, the end."""
+
+        def leave_out(compilation: float) -> None:
+            self.seconds -= compilation
+
+        times = [time.perf_counter()]
+        with self.qps, install_timer("numba:compile", leave_out):
+            yield times
+        times.append(time.perf_counter())
+        self.seconds += times[-1] - times[0]
 
     def add(self, batch: TensorDictBase, violation: Tensor) -> None:
         """Add an update with its collected batch and the violation of each state."""

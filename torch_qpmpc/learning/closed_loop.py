@@ -50,11 +50,8 @@ class SimulatedPlant:
     The innovations are drawn from those of the log, scaled to the model's covariance and its
     `growth` with the state and the action.
 
-    Args:
-        models: the plants.
-        observer: the model of the filter.
-        log: the trajectories with the innovations.
-        cost: maps estimates ``(count, n)`` and actions ``(count, n_u)`` to costs ``(count,)``.
+    ``observer`` is the model of the filter, and ``cost`` maps estimates ``(count, n)`` and actions
+    ``(count, n_u)`` to costs ``(count,)``.
     """
 
     def __init__(
@@ -194,17 +191,10 @@ def _noise(model: Innovations, log: Sequence[Trajectory]) -> tuple[Tensor, Tenso
 def growth(e: np.ndarray, v: np.ndarray) -> np.ndarray:
     r"""Return how the variances of innovations grow with states and actions.
 
-    The variance of an entry of e is the mean one times ``c_0 + sum_i c_i v_i^2``. The c are of
-    maximum likelihood where a likelihood-ratio test of 1 % rejects a constant variance, else c_0 =
-    1. The statistic is divided by (kurtosis - 1) / 2, which makes it right for other distributions
-    than the normal one.
-
-    Args:
-        e: innovations, ``(m, n_y)``.
-        v: the states and actions before them, ``(m, n)``.
-
-    Returns:
-        c: ``(n_y, 1 + n)``.
+    The variance of an entry of the innovations e ``(m, n_y)`` after states and actions v ``(m, n)``
+    is the mean one times ``c_0 + sum_i c_i v_i^2``. The c ``(n_y, 1 + n)`` have the most likelihood
+    where a likelihood-ratio test of 1 % rejects a constant variance, else c_0 = 1. The statistic is
+    divided by (kurtosis - 1) / 2, which makes it right for other distributions than the normal one.
     """
     m, n = v.shape
     sizes = np.concatenate(([1.0], (v**2).mean(0)))
@@ -412,13 +402,8 @@ def improve(
 class Descent:
     """Moves theta along the gradient of the mean cost of closed loops, by Adam.
 
-    Each entry of theta's coordinates has the unit that the signals of the first loops give it.
-
-    Args:
-        mpc, plant, loops, steps, rate, window: as in `improve`.
-
-    Attributes:
-        optimizer: the optimiser, in these units.
+    Each entry of theta's coordinates has the unit that the signals of the first loops give it, in
+    which ``optimizer`` works. Arguments are as in `improve`.
 
     Raises:
         QPError: ``mpc`` learns nothing.
@@ -460,10 +445,7 @@ class Descent:
     def update(self, penalty: Callable[[QPMPC], Tensor] | None = None) -> Tensor:
         """Move theta once; return the mean cost of a step.
 
-        A cost or gradient that is not finite moves nothing.
-
-        Args:
-            penalty: as in `improve`.
+        A cost or gradient that is not finite moves nothing. ``penalty`` is as in `improve`.
         """
         self._mpc.zero_grad()
         mean = self._loops.run(self._mpc, self._window)[1].mean()

@@ -259,10 +259,8 @@ class Gate:
         """Compare ``candidate`` with the policy that is kept, on new starts and disturbances.
 
         Pairs are added until the test is decided, the candidate's mean cost is no lower, or there
-        are ``pairs``.
-
-        An accepted candidate's parameters are copied to the policy that is kept; after ``patience``
-        rejections in a row it is the other way round.
+        are ``pairs``. An accepted candidate's parameters are copied to the policy that is kept;
+        after ``patience`` rejections in a row it is the other way round.
 
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.

@@ -244,10 +244,8 @@ class GaussNewton(torch.optim.Optimizer):
     ) -> float:
         """Move and project theta; return the ratio of actual to predicted decrease.
 
-        Args:
-            blocks, steps: the parts and their steps.
-            errors, change: TD errors and residuals, and the step's predicted change of both.
-            batch: s, a, the rows' factors, 0 if not usable, and the solution before the step.
+        ``change`` is the step's predicted one of the TD errors and residuals ``errors``; ``batch``
+        has s, a, the rows' factors, 0 if not usable, and the solution before the step.
         """
         s, a, root, solution = batch
         lr, before = self.param_groups[0]["lr"], objective(errors, blocks)

@@ -22,7 +22,7 @@ from torchrl.data import (
     SliceSampler,
 )
 
-from torch_qpmpc.checks import check_kind, check_seed, check_whole
+from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.program import UNKNOWN
 
@@ -43,18 +43,8 @@ def windows_to_tau(windows: TensorDictBase, preview_key: NestedKey | None = None
 
     Returns:
         ``(M, n_p + N (n_x + n_u))``.
-
-    Raises:
-        QPError: if an entry is missing.
     """
-    check_kind("windows", windows, TensorDictBase)
     known = ["observation"] if preview_key is None else [preview_key, "observation"]
-    needed = (*known, "action", ("next", "observation"))
-    if windows.batch_dims < 1 or any(windows.get(key, None) is None for key in needed):
-        present = ", ".join(map(str, windows.keys(True, True)))
-        names = ", ".join(map(str, known))
-        want = f"consecutive transitions (M, N) with {names}, action, (next, observation)"
-        raise QPError.expected("windows", f"shape {tuple(windows.shape)} with {present}", want)
     p = [windows[key][..., 0, :] for key in known]
     pairs = torch.cat([windows["action"], windows["next", "observation"]], dim=-1)
     return torch.cat([*p, pairs.flatten(-2)], dim=-1)
@@ -81,8 +71,7 @@ class Replay:
             it, both uniformly, without changing the stored done flags.
 
     Raises:
-        QPError: if a number is out of range, ``capacity`` is not a multiple of ``num_envs``, or it
-            holds fewer than ``window`` rows.
+        QPError: ``capacity`` is no multiple of ``num_envs``, or holds fewer than ``window`` rows.
     """
 
     def __init__(
@@ -98,13 +87,6 @@ class Replay:
         active_rows: int | None = None,
         preview_key: NestedKey | None = None,
     ) -> None:
-        sizes = {"num_envs": num_envs, "batch_size": batch_size, "window": window}
-        for name, size in (sizes | {"num_windows": num_windows}).items():
-            check_whole(name, size, 1)
-        check_whole("capacity", capacity, 0)
-        check_seed(seed)
-        if active_rows is not None:
-            check_whole("active_rows", active_rows, 0)
         if capacity % num_envs or capacity // num_envs < window:
             expected = f"a multiple of num_envs = {num_envs}, at least window * num_envs"
             remedy = f"The smallest is {window * num_envs}."
@@ -133,7 +115,7 @@ class Replay:
         """Store a collector's batch ``(num_envs, T)``; a full storage drops its oldest rows.
 
         Raises:
-            QPError: if ``batch`` is not a TensorDict or has another shape.
+            QPError: ``batch`` is no TensorDict, or has another shape.
         """
         remedy = "Pass the collector's batch as it comes."
         check_kind("batch", batch, TensorDictBase, remedy)
@@ -149,33 +131,18 @@ class Replay:
         self.transitions.extend(batch)
 
     def sample(self) -> TensorDictBase:
-        """Sample transitions, each with its row and column as ``"index"`` ``(batch_size, 2)``.
-
-        Raises:
-            QPError: if nothing is stored.
-        """
-        if not len(self):
-            remedy = "Call extend() first."
-            raise QPError.expected("replay", "nothing stored", "transitions", remedy)
+        """Sample transitions, each with its row and column as ``"index"`` ``(batch_size, 2)``."""
         sample, info = self.transitions.sample(return_info=True)
         return sample.set("index", torch.stack(info["index"], -1))
 
     def remember(self, sample: TensorDictBase) -> None:
-        """Store the active sets that the loss wrote into a sample, for the next time it is drawn.
-
-        Raises:
-            QPError: if they or the sample's indices are missing.
-        """
+        """Store the active sets that the loss wrote into a sample, for its next draw."""
         if self.active_rows is None:
             return
-        for key in ("index", *ACTIVE_SETS):
-            if sample.get(key, None) is None:
-                remedy = "Pass what sample() returned, after the loss."
-                raise QPError.expected("sample", f"no entry {key}", "one", remedy)
         stored: Any = self.transitions.storage[:]
-        place = sample.get("index").unbind(-1)
+        place = sample["index"].unbind(-1)
         for key in ACTIVE_SETS:
-            stored.get(key)[place] = sample.get(key)
+            stored.get(key)[place] = sample[key]
 
     def end_episodes(self) -> None:
         """Make the stored trajectory ids differ from a new collector's, which are >= 0."""
@@ -189,27 +156,9 @@ class Replay:
         stored: Any = self.transitions.storage[:]
         return stored.transpose(0, 1)
 
-    def has_windows(self) -> bool:
-        """Return True if a stored trajectory has the N steps of a window."""
-        return self.windows.can_sample()
-
     def sample_tau(self) -> Tensor:
-        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see `windows_to_tau`.
-
-        Raises:
-            QPError: if no stored trajectory has N steps yet.
-        """
-        try:
-            sample = self.windows.sample()
-        except RuntimeError as error:
-            # Checked only now, because looking for windows costs as much as sampling them.
-            if self.has_windows():
-                raise
-            got = f"no window in {len(self)} transitions"
-            remedy = "Collect more, until has_windows() is True."
-            expected = f"{self.window} consecutive transitions"
-            raise QPError.expected("replay", got, expected, remedy) from error
-        return windows_to_tau(sample.reshape(-1, self.window), self.preview_key)
+        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see `windows_to_tau`."""
+        return windows_to_tau(self.windows.sample().reshape(-1, self.window), self.preview_key)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored data (not copied: save them at once), write position and generator."""
@@ -220,14 +169,7 @@ class Replay:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a `state_dict` into a replay made with the same arguments.
-
-        Raises:
-            QPError: if ``state`` lacks an entry.
-        """
-        if missing := {"storage", "writer", "generator"} - set(state):
-            got = f"no {', '.join(sorted(missing))}"
-            raise QPError.expected("state", got, "what state_dict() returned")
+        """Restore a `state_dict` into a replay made with the same arguments."""
         storage, writer = self.transitions.storage, self.transitions.writer
         storage.load_state_dict(state["storage"])
         writer.load_state_dict(state["writer"])

@@ -25,13 +25,9 @@ TINY = 1e-9
 
 
 def usable(solved: Tensor, target: Tensor) -> tuple[Tensor, tuple[int, int]]:
-    """Return True for pairs with a solution and a finite target, and how many lack each.
+    """Return True for pairs ``(B,)`` with a solution and a finite target, and how many lack each.
 
     A pair that lacks both counts as unsolved. If none is left, a `RuntimeWarning` says so.
-
-    Args:
-        solved: True for a pair with a solution, ``(B,)``.
-        target: ``(B,)``.
     """
     use = solved & target.isfinite()
     unsolved = int((~solved).sum())
@@ -96,14 +92,9 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
     (Aitken, "On least squares and linear combinations of observations", 1935). The log of the
     variance is linear in the logs of the squares of p and a, as deviations from their means, and of
     |Q(p, a)| (Harvey, "Estimating regression models with multiplicative heteroscedasticity",
-    Econometrica 1976). Its coefficients are the least-squares fit to the batch's log delta^2.
-
-    Args:
-        p, a: what is known and the action, ``(B, n_p)`` and ``(B, n_u)``.
-        value: Q(p, a), ``(B,)``.
-        error: the TD errors, ``(B,)``.
-        use: True for the usable pairs, ``(B,)``. The others, and all if they are few or without an
-            error, have the weight one.
+    Econometrica 1976). Its coefficients are the least-squares fit to the batch's log delta^2. Pairs
+    that are not to ``use`` ``(B,)``, and all if they are few or without an error, have the weight
+    one. p is ``(B, n_p)``, a ``(B, n_u)``, and ``value`` Q(p, a) and ``error`` are ``(B,)``.
     """
     weight = torch.ones_like(error)
     square = error[use].square()

@@ -37,13 +37,7 @@ def first_order(
 ) -> Update:
     """Return an update by a torch optimiser on the gradient of the loss and the penalties.
 
-    A loss or gradient that is not finite changes nothing either.
-
-    Args:
-        mpc: the QPMPC that is penalised and projected.
-        loss_module: the loss.
-        optimizer: any torch optimiser of the parameters in ``loss_module``.
-        deviation, si: the penalties on C; None for none.
+    A loss or gradient that is not finite changes nothing either. Penalties that are None are off.
 
     Raises:
         QPError: the SI penalty is of one C for all states, and the QPMPC has a schedule.
@@ -83,13 +77,7 @@ def second_order(
     """Return an update by a `GaussNewton` step towards the loss module's targets.
 
     The SI penalty and the projection are part of that step; the deviation penalty's proximal step
-    follows, even if that step is not accepted.
-
-    Args:
-        mpc: the QPMPC that ``loss_module`` and ``optimizer`` learn.
-        loss_module: the loss that defines the targets.
-        optimizer: the optimiser of ``mpc``.
-        deviation, si: the penalties on C; None for none.
+    follows, even if that step is not accepted. Penalties that are None are off.
 
     Raises:
         QPError: the value network has other modules or ``theta_keys``: the step's curvature is that

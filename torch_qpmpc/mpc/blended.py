@@ -14,6 +14,7 @@ For a controller the model is linearised at s, with the derivative of the weight
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -111,56 +112,41 @@ class BlendedModel(nn.Module):
         Raises:
             QPError: a shape is wrong.
         """
-        s, u = self._pairs(s, u)
-        return (self.weights(s).unsqueeze(-1) * self._local(s, u)).sum(-2)
+        u = check_tensor("u", u, self.B.shape[-1]).to(self.B)
+        local = self._drift(s) + torch.einsum("ijk,...k->...ij", self.B, u)
+        return (self.weights(s).unsqueeze(-1) * local).sum(-2)
 
-    def linearised(self, s: Tensor, u: Tensor | None = None) -> Linearised:
-        """Return the linear model that agrees with this one and its derivatives at (s, u).
+    def linearised(self, s: Tensor) -> Linearised:
+        """Return the linear model that agrees with this one and its derivatives at (s, 0).
 
         Args:
             s: ``(*batch, n_x)``.
-            u: ``(*batch, n_u)``, zero by default.
 
         Raises:
             QPError: a shape is wrong.
         """
-        s, u = self._pairs(s, self.B.new_zeros(self.B.shape[-1]) if u is None else u)
-        w, local = self.weights(s), self._local(s, u)
+        local, w = self._drift(s), self.weights(s)
         ahead = (w.unsqueeze(-1) * local).sum(-2)
         # dw_i = w_i (de_i - sum_j w_j de_j), with the exponents e of the softmax.
         slopes = -self._distances(s) / (self.width * self.size)
         slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
         A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
         B = torch.einsum("...i,ijk->...jk", w, self.B)
-        at = torch.cat((s, u), -1).to(A).unsqueeze(-1)
-        return Linearised(A, B, ahead - (torch.cat((A, B), -1) @ at).squeeze(-1))
+        return Linearised(A, B, ahead - (A @ s.to(A).unsqueeze(-1)).squeeze(-1))
 
-    def constraints(
-        self, s: Tensor, horizon: int, plan: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Return C ``(*batch, N n_x, n_z)`` and b ``(*batch, N n_x)`` of the model (eq:cband).
+    def constraints(self, s: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+        """Return C ``(*batch, N n_x, n_z)`` and b ``(*batch, N n_x)`` of `linearised` (eq:cband).
 
         Args:
             s: ``(*batch, n_x)``.
             horizon: N.
-            plan: actions, ``(*batch, N, n_u)``, along whose prediction the model is linearised in
-                each stage, as in sequential quadratic programming; by default it is linearised at
-                (s, 0) for all stages.
 
         Raises:
             QPError: a shape is wrong.
         """
-        if plan is None:
-            stages = [self.linearised(s)] * horizon
-        else:
-            stages, x = [], s
-            for u in check_tensor("plan", plan, horizon, self.B.shape[-1]).unbind(-2):
-                stages.append(self.linearised(x, u))
-                x = self(x, u)
-        A = torch.stack([stage.A for stage in stages], -3)
-        B = torch.stack([stage.B for stage in stages], -3)
-        b = -torch.cat([stage.offset for stage in stages], -1)
-        return for_each(partial(banded_matrix, horizon=horizon), (A, B), (3, 3)), b
+        A, B, offset = self.linearised(s)
+        C = for_each(partial(banded_matrix, horizon=horizon), (A, B), (2, 2))
+        return C, -torch.cat([offset] * horizon, -1)
 
     @property
     def arguments(self) -> dict[str, Tensor]:
@@ -170,28 +156,15 @@ class BlendedModel(nn.Module):
     def extra_repr(self) -> str:
         return f"centres={len(self.centres)}, n_x={self.B.shape[-2]}, n_u={self.B.shape[-1]}"
 
-    def _pairs(self, s: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Return s and u with the same batch dimensions."""
-        n_x, n_u = self.B.shape[-2:]
-        s, u = check_tensor("s", s, n_x), check_tensor("u", u, n_u)
-        try:
-            batch = torch.broadcast_shapes(s.shape[:-1], u.shape[:-1])
-        except RuntimeError as error:
-            got, want = f"shape {tuple(u.shape)}", "leading dimensions that broadcast with those of"
-            raise QPError.expected("u", got, f"{want} s, {tuple(s.shape)}") from error
-        return s.expand(*batch, -1), u.expand(*batch, -1)
-
     def _distances(self, s: Tensor) -> Tensor:
         """Return s minus the centres in units of h, ``(*batch, m, n_x)``."""
         z = (s.to(self.middle) - self.middle) / self.size
         return (z.unsqueeze(-2) - self.centres) / self.width
 
-    def _local(self, s: Tensor, u: Tensor) -> Tensor:
-        """Return the prediction of each local model, ``(*batch, m, n_x)``."""
-        of_s, of_u = (
-            torch.einsum("ijk,...k->...ij", M, v.to(M)) for M, v in ((self.A, s), (self.B, u))
-        )
-        return of_s + of_u + self.offset
+    def _drift(self, s: Tensor) -> Tensor:
+        """Return the prediction of each local model without an action, ``(*batch, m, n_x)``."""
+        s = check_tensor("s", s, self.B.shape[-2]).to(self.A)
+        return torch.einsum("ijk,...k->...ij", self.A, s) + self.offset
 
 
 def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> BlendedModel:
@@ -201,19 +174,18 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
         QPError: it is none, it has other sizes, or the QPMPC has a preview.
     """
     if isinstance(model, BlendedModel):
-        copy = BlendedModel(**model.arguments)
-        copy.R2 = dict(model.R2)
+        own = copy.deepcopy(model)
     elif isinstance(model, Mapping) and {*model} == {*BlendedModel.__annotations__}:
-        copy = BlendedModel(**model)
+        own = BlendedModel(**model)
     else:
         got = f"keys {', '.join(map(str, model))}" if isinstance(model, Mapping) else repr(model)
         remedy = "identify_blended returns one."
         raise QPError.expected("schedule", got, "a BlendedModel, or its arguments", remedy)
     sizes = (layout.n_x, layout.n_u, layout.n_d)
-    if sizes != (own := (*copy.B.shape[-2:], 0)):
-        got, expected = (f"n_x, n_u, n_d = {x}" for x in (own, sizes))
+    if sizes != (found := (*own.B.shape[-2:], 0)):
+        got, expected = (f"n_x, n_u, n_d = {x}" for x in (found, sizes))
         raise QPError.expected("schedule", got, f"{expected}, as the QPMPC")
-    return copy
+    return own
 
 
 def identify_blended(
@@ -244,10 +216,8 @@ def identify_blended(
         (True, True)
     """
     check_whole("horizon", horizon, 1)
-    counts = [int(centres)] if isinstance(centres, Integral) else centres
-    if not isinstance(counts, Sequence) or isinstance(counts, str) or not counts:
-        raise QPError.expected("centres", repr(centres), "a whole number, or a list of them")
-    for count in counts:
+    counts: Any = [int(centres)] if isinstance(centres, Integral) else centres
+    for count in counts or (None,):
         check_whole("centres", count, 1)
     log = as_log(trajectories)
     if log.known:

@@ -70,10 +70,8 @@ class Cost:
     ) -> dict[str, Tensor]:
         """Return H and H_f in the shapes for ``hessian``; only H if it is full.
 
-        Args:
-            layout: the sizes.
-            A, B, gamma: the model and the discount, for a terminal weight of the regulator.
-            random: draws a stage weight that is None.
+        A terminal weight of the regulator is that of A, B and gamma; ``random`` draws a stage
+        weight that is None.
 
         Raises:
             QPError: a shape does not match the sizes, or a weight is not positive semidefinite.

@@ -544,7 +544,7 @@ def _of_rows(data: Any, n_x: int | None, n_d: int) -> list[Trajectory]:
     d = u.new_zeros(*u.shape[:-1], 0)
     if n_d:
         d = _entry(steps, ("preview",), valid, n_d, first=True)
-    valid, ends = _cuts(steps, valid, (following[:, :-1] != y[:, 1:]).any(-1))
+    valid, ends = cuts(steps, n_x)
     trajectories = []
     for row in range(len(y)):
         start = 0
@@ -556,24 +556,11 @@ def _of_rows(data: Any, n_x: int | None, n_d: int) -> list[Trajectory]:
     return trajectories
 
 
-def kept_steps(steps: Any) -> Tensor:
-    """Return True for the steps that `as_log` keeps, in the log's shape."""
-    rows = steps if steps.batch_dims == 2 else steps.unsqueeze(0)
-    jumps = (rows[NEXT][:, :-1] != rows["observation"][:, 1:]).flatten(2).any(-1)
-    return _cuts(rows, valid_steps(rows), jumps)[0].reshape(steps.shape)
-
-
-def _cuts(steps: Any, valid: Tensor, jumps: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the steps that are kept, and those that end a trajectory, ``(episodes, T)``.
-
-    Args:
-        steps: the logged steps.
-        valid: True for those that are not padding.
-        jumps: True where the next observation differs from the following step's,
-            ``(episodes, T - 1)``.
-    """
-    ends = _flags(steps, ENDS, default=False)
-    ends[:, :-1] |= jumps
+def cuts(steps: Any, n_x: int | None = None) -> tuple[Tensor, Tensor]:
+    """Return the steps that `as_log` keeps, and those that end a trajectory, ``(episodes, T)``."""
+    y, following = (steps[key][..., -(n_x or 0) :].cpu() for key in ("observation", NEXT))
+    valid, ends = valid_steps(steps), _flags(steps, ENDS, default=False)
+    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1)
     for key in IDS:
         if (ids := steps.get(key, None)) is not None:
             ids = _narrow(key, ids, steps.shape)
@@ -619,15 +606,11 @@ def _entry(
     if value is None:
         present = ", ".join(_name(x) for x in steps.keys(True, True)) or "nothing"
         raise QPError.expected("trajectories", f"only {present}", f"an entry {name}", REMEDY)
-    batch = tuple(steps.shape)
-    wanted = f"a real tensor {(*batch, 'n')}"
-    if width is not None:
-        wanted += f" with n >= {width}"
-    if not isinstance(value, Tensor) or value.is_complex() or value.ndim != len(batch) + 1:
+    real = isinstance(value, Tensor) and not value.is_complex()
+    if not real or value.ndim != steps.ndim + 1 or value.shape[-1] < (width or 1):
         got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+        wanted = f"a real tensor {(*steps.shape, 'n')} with n >= {width or 1}"
         raise QPError.expected(name, got, wanted, REMEDY)
-    if value.shape[-1] < (width or 1):
-        raise QPError.expected(name, f"shape {tuple(value.shape)}", wanted)
     value = ungraded(name, value).detach().to("cpu", torch.float64)
     if width is not None:
         value = value[..., :width] if first else value[..., value.shape[-1] - width :]

@@ -177,10 +177,8 @@ class Leaves:
     """The modules and tensors that a QPMPC's theta follows from, and their content.
 
     Contents are compared, as versions do not show changes by ``.data``, NumPy or other processes;
-    those of large parts that are not learned, which would take the longest, are not.
-
-    Attributes:
-        known: True if all tensors are plain and none is a plain attribute, as in functional calls.
+    those of large parts that are not learned, which would take the longest, are not. They are
+    ``known`` if all tensors are plain and none is a plain attribute, as in functional calls.
     """
 
     def __init__(self, module: Any) -> None:

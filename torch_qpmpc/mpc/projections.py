@@ -5,21 +5,12 @@ The program, with 1/2 |dtheta|^2 for the printed dtheta^2 (whose minimum is half
     min over dtheta:  1/2 |dtheta|^2 - alpha g'dtheta   subject to   H(theta + dtheta) >= 0
 
 has as its solution the point with H >= 0 nearest to the optimiser's proposal theta + alpha g. All
-parts of theta but H take the plain step. If theta lists every entry of H, |dtheta| is the Frobenius
-norm, and the nearest point has a closed form: the proposal without its negative eigenvalues, for
-each block of a block-diagonal H; a diagonal H is clipped at zero. It makes no difference if stages
-share a block or discount it. So ``"projection"`` and ``"sdp"`` make the same step, and
-``"cholesky"`` makes another, in the factor of H, which needs neither.
-
-Projection and program differ if |dtheta| is another norm:
-
-* If theta lists the upper triangle only, entries off the diagonal count once, not twice.
-* In the metric of Adam, whose step sizes differ by entry, the nearest point of a block is another.
-  That of a diagonal is the same, as in every diagonal metric.
-* In the metric of Gauss-Newton, which couples all of theta, it is another even for a diagonal.
-
-Both rules take the nearest point in the Frobenius norm, for the proposal of any optimiser;
-`GaussNewton` judges the projected step.
+parts of theta but H take the plain step. If |dtheta| is the Frobenius norm of H, the nearest point
+has a closed form: the proposal without its negative eigenvalues, for each block of a block-diagonal
+H; a diagonal H is clipped at zero. So ``"projection"`` and ``"sdp"`` make the same step, for the
+proposal of any optimiser, and ``"cholesky"`` another, in the factor of H, which needs neither. In
+the metrics of Adam and Gauss-Newton the nearest point is another one; `GaussNewton` judges the
+projected step.
 """
 
 from __future__ import annotations

@@ -30,19 +30,11 @@ def fit_rewards(
     """Fit the stage cost of (d_k, x_k, u_k) to the rewards of a log, as `fit_stage_cost`.
 
     Many plants reward the next state. With a ``model`` a cost of (x_{k+1}, u_k) is fitted, too: if
-    it explains more, it is returned as the cost of (x_k, u_k) that the model makes of it.
-
-    Args:
-        log: logged steps, as in `as_log`, with ``("next", "reward")``.
-        layout: the sizes.
-        diagonal: fit a diagonal W.
-        model: the model of the states; not used for a diagonal W or with known signals.
+    it explains more, it is returned as the cost of (x_k, u_k) that the model makes of it, but not
+    for a ``diagonal`` W or with known signals. An R2 below 0.9 is warned of.
 
     Raises:
-        QPError: rewards are missing or not finite.
-
-    Warns:
-        UserWarning: R2 is below 0.9.
+        QPError: rewards ``("next", "reward")`` are missing or not finite.
     """
     parts = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
     x, u, following, cost = map(torch.cat, parts)

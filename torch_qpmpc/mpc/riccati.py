@@ -58,12 +58,8 @@ def stage_weight(mpc: QPMPC) -> Tensor:
 def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
     """Return P ``(n_x, n_x)`` of the discounted linear quadratic regulator's cost to go 1/2 x'Px.
 
-    Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon.
-
-    Args:
-        A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
-        W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
-        gamma: discount of the stage costs.
+    Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon. Arguments
+    are as in `lqr_gain`.
 
     Raises:
         QPError: the discrete Riccati equation has no stabilising solution.
@@ -91,13 +87,7 @@ def affine_cost_to_go(
 
     The model is ``A x + B u + offset``, and the stage cost ``1/2 v'Wv + q'v`` of v = [x; u].
     Without active bounds, an MPC scheme with H_f = P and q_f = p is the optimal policy, for any
-    horizon. Without a discount c has no finite value.
-
-    Args:
-        A, B, W, gamma: as in `riccati_weight`.
-        offset: ``(n_x,)``.
-        q: ``(n_x + n_u,)``.
-        P: the `riccati_weight`.
+    horizon. Without a discount c has no finite value. P is the `riccati_weight` of A, B and W.
     """
     n_x = len(A)
     # The regulator is u = -K x - k; an action without any cost has none.
@@ -114,11 +104,7 @@ def affine_cost_to_go(
 def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layout) -> Tensor:
     """Return P for a scheme's model and stage weight, about the x of least stage cost for d.
 
-    Args:
-        A, B: the model.
-        W: the stage weight, or its diagonal; with a preview, of [d; x; u] or of [x; u].
-        gamma: the discount.
-        layout: the sizes.
+    W is the stage weight, or its diagonal; with a preview, of [d; x; u] or of [x; u].
 
     Raises:
         QPError: the scheme has several stages, or there is no solution.

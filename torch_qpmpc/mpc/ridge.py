@@ -24,14 +24,7 @@ def ridge(
     D holds the root mean squares of X's columns, so that W does not depend on their units. By
     default the strength is ``share`` of the one with the largest evidence, the likelihood of Y
     ``(n, n_y)`` under a Gaussian prior of W, for each column of Y by itself; the variance of the
-    noise has its likeliest value.
-
-    Args:
-        X: regressors, ``(n, m)``.
-        Y: targets, ``(n, n_y)``.
-        strength: the strength; None lets the evidence choose it.
-        strengths: those among which the evidence decides.
-        share: the share of that strength which is used.
+    noise has its likeliest value. X is ``(n, m)``, and the evidence decides among ``strengths``.
     """
     n, m = X.shape
     size = X.square().mean(0).sqrt()
@@ -58,12 +51,8 @@ def ridge(
 def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int, strengths: Tensor) -> Tensor:
     """Return the strength of the largest evidence for each target, ``(n_y,)``.
 
-    Args:
-        s: singular values of the regressors, ``(r,)``.
-        a: targets in the basis of the left singular vectors, ``(r, n_y)``.
-        outside: squared norms of the targets outside of that basis, ``(n_y,)``.
-        n: the number of samples.
-        strengths: the candidates.
+    ``s`` ``(r,)`` are the singular values of n regressors, ``a`` ``(r, n_y)`` the targets in the
+    basis of the left singular vectors, ``outside`` ``(n_y,)`` their squared norms outside of it.
     """
     gain = 1 + s.square() / (n * strengths.unsqueeze(-1))
     noise = outside + (a.square() / gain.unsqueeze(-1)).sum(1)

@@ -25,13 +25,7 @@ CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 
 
 def check_learn(learn: Collection[str], structure: str, hessian: str, n_linear: int) -> None:
-    """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn.
-
-    Args:
-        learn: the argument of `QPMPC`.
-        structure, hessian: of the QPMPC and its cost.
-        n_linear: rows of D and D^f.
-    """
+    """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn."""
     parts = (*COST, *CONSTRAINTS)
     if (
         not isinstance(learn, Collection)

@@ -30,7 +30,8 @@ from torch_qpmpc.experiment.checkpoint import learned_qp
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import NUMBERS, read_metrics, read_summary
 from torch_qpmpc.experiment.start import read_observer
-from torch_qpmpc.experiment.tasks import AnyPlant, has_run, make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
+from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.module import QPMPC

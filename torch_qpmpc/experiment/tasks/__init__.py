@@ -12,14 +12,7 @@ from omegaconf import DictConfig
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
-from torch_qpmpc.experiment.tasks.code import (
-    COMMAND,
-    has_run,
-    named_code,
-    named_task,
-    resume_arguments,
-    run_code,
-)
+from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     TASKS,
@@ -38,23 +31,18 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
 __all__ = [
-    "COMMAND",
     "TASKS",
     "AnyPlant",
     "Task",
     "TaskSettings",
     "find_task",
-    "has_run",
     "make_mpc",
     "make_physics",
     "make_true_mpc",
-    "named_code",
-    "named_task",
     "plant_layout",
     "plant_scheme",
     "priced",
     "register",
-    "resume_arguments",
     "run_code",
 ]
 

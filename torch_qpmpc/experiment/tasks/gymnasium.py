@@ -86,34 +86,20 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         QPError: a matrix is missing, or does not have the shape of the environment's spaces.
     """
     n_x, n_u = plant.n_x, len(plant.lb_a)
-    needed = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
-    spaces = f"{plant.id!r}, whose observation has {n_x} entries and whose action has {n_u}"
-    matrices: dict[str, Any] = dict.fromkeys(needed)
-    for name, shape in needed.items():
-        rows = cfg.task[name]
-        if rows is not None:
-            matrices[name] = torch.tensor(rows, dtype=torch.float64)
-        elif cfg.start.name != "data":
-            expected = f"the rows of a matrix {shape} for {spaces}"
+    shapes = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
+    for name, shape in shapes.items():
+        if cfg.task[name] is None and cfg.start.name != "data":
+            expected = f"the rows of a matrix {shape} for {plant.id!r}"
             raise QPError.expected(f"task.{name}", "null", expected, REMEDY)
-    shapes = {name: needed[name] if x is None else tuple(x.shape) for name, x in matrices.items()}
-    if shapes != needed:
-        got, expected = (
-            ", ".join(
-                f"task.{name} of shape {shape}"
-                for name, shape in sizes.items()
-                if matrices[name] is not None
-            )
-            for sizes in (shapes, needed)
-        )
-        remedy = "" if cfg.start.name == "data" else REMEDY
-        raise QPError.expected("task.id", f"{spaces}, with {got}", expected, remedy)
-    model = Model(matrices["A"], matrices["B"])
+    A, B, weight = (
+        None if rows is None else torch.tensor(rows, dtype=torch.float64)
+        for rows in map(cfg.task.get, shapes)
+    )
     states = torch.full((2, n_x), torch.inf, dtype=torch.float64)
     states[0] = -states[0]
     if cfg.task.observation_bounds:  # the outputs are the first states
         states[0, : len(plant.lb_s)], states[1, : len(plant.ub_s)] = plant.lb_s, plant.ub_s
-    return plant_scheme(cfg, plant, model, matrices["stage_weight"], (states[0], states[1]))
+    return plant_scheme(cfg, plant, Model(A, B), weight, (states[0], states[1]))
 
 
 register(

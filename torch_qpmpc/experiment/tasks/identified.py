@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +16,6 @@ from torch import Tensor
 from torch_qpmpc.envs import KalmanFilter, LinearSystem, Plant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.blow_ups import without_blow_ups
-from torch_qpmpc.experiment.tasks.choice import Choice
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
 from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
@@ -24,15 +23,19 @@ from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, check_excitation, measured_model
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import NEXT, as_log, kept_steps, valid_steps
+from torch_qpmpc.mpc.log import NEXT, as_log, cuts, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.projections import nearest_psd
 from torch_qpmpc.mpc.rewards import GOOD, fit_rewards, poor, scheme_cost
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.stage_cost import StageCost
 from torch_qpmpc.mpc.subspace import fit_state_space
 from torch_qpmpc.mpc.tightening import back_off
+
+if TYPE_CHECKING:
+    from torch_qpmpc.experiment.choosing import Choice
 
 
 class Start(NamedTuple):
@@ -145,19 +148,14 @@ def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:
     y, following, u = (rows[key].double() for key in ("observation", NEXT, "action"))
     n_d = observer.E.shape[-1]
     d = rows["preview"][..., :n_d].double() if n_d else u[..., :0]
-    ends = rows.get(("next", "done"), torch.zeros_like(y[..., :1], dtype=torch.bool))[..., 0]
-    ends = ends | ~kept_steps(rows)
-    ends[:, :-1] |= (following[:, :-1] != y[:, 1:]).any(-1)
-    model, pairs = KalmanFilter(observer), []
-    x = model.first(y[:, 0])
-    step = torch.zeros(len(x), dtype=torch.int64)
+    (_, ends), model, pairs = cuts(rows), KalmanFilter(observer), []
+    first, step = model.first(y), torch.zeros(len(y), dtype=torch.int64)
+    x = first[:, 0]
     for k in range(y.shape[1]):
-        step = step + 1
-        after = model.following(x, u[:, k], d[:, k], following[:, k], step)
+        after = model.following(x, u[:, k], d[:, k], following[:, k], step + 1)
         pairs.append((x, after))
-        if k + 1 < y.shape[1]:
-            x = torch.where(ends[:, k, None], model.first(y[:, k + 1]), after)
-            step = torch.where(ends[:, k], 0, step)
+        x = torch.where(ends[:, k, None], first[:, (k + 1) % y.shape[1]], after)
+        step = torch.where(ends[:, k], 0, step + 1)
     now, after = (torch.stack(part, 1).reshape(*log.shape, -1) for part in zip(*pairs, strict=True))
     return log.clone(recurse=False).set("observation", now).set(NEXT, after)
 
@@ -195,8 +193,7 @@ def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
         P = terminal_riccati(A, B, cost.stage_weight, gamma, layout)
         return replace(cost, terminal_weight=P, q=F.pad(first, (0, layout.n_x)))
     P = terminal_riccati(A, B, fitted.W, gamma, layout)
-    values, vectors = torch.linalg.eigh(P)
-    P = vectors * values.clamp(min=0) @ vectors.mT  # up to rounding, it is that
+    P = nearest_psd(P)  # up to rounding, it is that
     p, ahead = affine_cost_to_go(A, B, offset, fitted.W, fitted.q, P, gamma)
     c = cost.c
     if gamma < 1:
@@ -247,12 +244,7 @@ def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBa
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a
     second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
     the covariance of the prediction errors, so that it holds with a probability of 95 % with the
-    feedback of `back_off`.
-
-    Args:
-        cfg: the run's configuration.
-        physics: the plant.
-        data: logs, each as in `identify`.
+    feedback of `back_off`. ``data`` are logs as in `identify`.
 
     Raises:
         QPError: the steps identify no model.
