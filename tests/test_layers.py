@@ -66,13 +66,13 @@ LAYERS = {
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 435,
-    "analysis": 1097,
+    "analysis": 1094,
     "control": 4309,
-    "envs": 1534,
-    "experiment": 3635,
+    "envs": 1502,
+    "experiment": 3622,
     "export": 1430,
-    "learning": 2871,
-    "mpc": 5380,
+    "learning": 2831,
+    "mpc": 5365,
     "proofs": 1003,
     "qp": 5934,
     "study": 614,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from typing import Any
 
 import gymnasium
@@ -283,19 +282,6 @@ def test_one_seed_is_one_set_of_different_episodes():
     assert torch.equal(starts(1), starts(1))
     assert not torch.equal(starts(1), starts(2))
     assert len(starts(1).unique(dim=0)) == 3
-
-
-def test_a_broken_gym_beside_gymnasium_is_named(tmp_path, monkeypatch):
-    (tmp_path / "gym.py").touch()
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setitem(sys.modules, "gym", None)  # so that the false one leaves at the end
-    del sys.modules["gym"]
-    wrong = (
-        r"^the module gym: got a broken one beside Gymnasium \(module 'gym' has no attribute "
-        rf"'spaces'\), expected none. Remove it, as by pip uninstall gym: {tmp_path}/gym.py\.$"
-    )
-    with pytest.raises(QPError, match=wrong):
-        GymnasiumPlant("Pendulum-v1").vectorised(2, 5, seed=0)
 
 
 def test_violation_is_the_distance_to_the_box():

@@ -28,10 +28,10 @@ def test_sizes_are_those_of_what_a_controller_sees():
     env = PLANT.vectorised(4, 6, seed=0)
     assert env.observation_spec["observation"].shape == (4, 2)
     assert env.observation_spec["preview"].shape == (4, 8)
-    assert (PLANT.n_preview, PLANT.n_p) == (8, 10)
+    assert PLANT.n_preview == 8
     observed = PLANT.observed(model(3, 2, 2))
     assert observed.vectorised(4, 6, seed=0).observation_spec["observation"].shape == (4, 3)
-    assert (observed.n_x, observed.n_p, PLANT.n_x) == (3, 11, 2)
+    assert (observed.n_x, PLANT.n_x) == (3, 2)
 
 
 def test_transitions_follow_the_plant():

@@ -93,7 +93,7 @@ def test_the_kind_alone_changes_the_default_noise():
 
 
 def test_bad_noise_is_an_error():
-    match = "noise_kind: got 'pink', expected 'gaussian' or 'brownian'"
+    match = "noise_kind: got 'pink', expected one of gaussian, brownian"
     with pytest.raises(QPError, match=match):
         PointMass("pink")
     for std in (-0.1, float("nan"), float("inf")):

@@ -67,7 +67,7 @@ def test_without_a_seed_the_global_generator_decides(make):
 
 def test_saved_generator_continues_the_stream(make):
     env, other = make(4, 3, seed=1), make(4, 3, seed=1)
-    td, state, policy = env.reset(), env.get_rng_state(), network_policy(env)
+    td, state, policy = env.reset(), env.rng.get_state(), network_policy(env)
 
     def rollout(env):
         options = {"auto_reset": False, "break_when_any_done": False, "tensordict": td.clone()}
@@ -78,7 +78,7 @@ def test_saved_generator_continues_the_stream(make):
     other.rollout(2)
     assert not torch.equal(rollout(other), expected)
     for one in (other, env):
-        one.set_rng_state(state)
+        one.rng.set_state(state)
         assert torch.equal(rollout(copy.deepcopy(one)), expected)
 
 

@@ -137,9 +137,9 @@ def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(stopped, whol
 
 def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     state = load_checkpoint(stopped / "checkpoint.pt")
-    del state["tally"]
+    del state["config"]
     save_checkpoint(stopped / "checkpoint.pt", state)
-    with pytest.raises(QPError, match=r"checkpoint: got one without tally, .*Another version"):
+    with pytest.raises(QPError, match=r"checkpoint: got a dict, .*Another version"):
         resumed(stopped, [])
     torch.save([1, 2], stopped / "checkpoint.pt")
     with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):

@@ -129,10 +129,6 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
             lambda: tighten(scheme(learn=("C", "ub")), SIGMA),
             "mpc: got one that learns ub, expected",
         ),
-        (lambda: prediction_covariance(B, W, N), "A: got shape .* expected shape"),
-        (lambda: prediction_covariance(A, B, N), "W: got shape .* expected shape"),
-        (lambda: prediction_covariance(A, W, -1), "horizon: got -1, expected a whole number"),
-        (lambda: prediction_covariance(A, W, N, B), "initial: got shape .* expected shape"),
         (lambda: back_off(None, W), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
         (lambda: back_off(scheme(), W), "structure: got 'free'"),
         (lambda: back_off(tied(), B), "W: got shape .* expected shape"),

@@ -20,7 +20,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
@@ -108,12 +108,9 @@ def prediction_form(
                 [0.5000, 1.0000, 0.0000],
                 [0.2500, 0.5000, 1.0000]], dtype=torch.float64)
     """
-    check_whole("n_x", n_x, 1)
-    check_whole("n_u", n_u, 1)
-    check_whole("n_d", n_d, 0)
     check_tensor("C", C, "N n_x", "n_z", remedy="Pass mpc.C.")
     n_c, n_z = C.shape[-2:]
-    N = n_c // n_x
+    N = n_c // max(n_x, 1)
     layout = Layout(n_x, n_u, max(N, 1), n_d)
     if N < 1 or n_c != N * n_x or n_z != layout.n_z:
         want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"

@@ -6,7 +6,6 @@ Unlike a `LinearSystem` it is a black box: it can only be reset and stepped.
 from __future__ import annotations
 
 import copy
-import importlib.util
 import math
 import traceback
 import warnings
@@ -118,9 +117,6 @@ class GymnasiumPlant:
         """Make a TorchRL environment of ``num_envs`` episodes of at most ``max_steps`` steps.
 
         None is the environment's own length. ``seed`` seeds all of them.
-
-        Raises:
-            QPError: a broken ``gym`` is installed beside Gymnasium.
         """
         check_whole("num_envs", num_envs, 1)
         max_steps = self.max_steps if max_steps is None else max_steps
@@ -129,14 +125,7 @@ class GymnasiumPlant:
         # TorchRL resets by itself; Gymnasium's reset would lose an episode's last observation.
         makers = [partial(self.make, max_steps)] * num_envs
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
-        try:
-            env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
-        except AttributeError as error:  # TorchRL looks at gym first, and this one is broken
-            if (gym := importlib.util.find_spec("gym")) is None:
-                raise
-            remedy = f"Remove it, as by pip uninstall gym: {gym.origin}."
-            got = f"a broken one beside Gymnasium ({error})"
-            raise QPError.expected("the module gym", got, "none", remedy) from error
+        env = TransformedEnv(GymWrapper(envs), DoubleToFloat())
         if self.observer is not None:
             env.append_transform(KalmanFilter(self.observer))
         env.set_seed(seed)

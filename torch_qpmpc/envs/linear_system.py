@@ -219,8 +219,7 @@ class LinearSystemGymEnv(gymnasium.Env):
         low, high = (lb_s, ub_s) if p.clips_states else (-np.inf, np.inf)
         self.observation_space = gymnasium.spaces.Box(low, high, lb_s.shape)
         self.action_space = gymnasium.spaces.Box(lb_a, ub_a)
-        self._s: Tensor | None = None
-        self._nu = torch.zeros_like(p.lb_s)
+        self._s = self._nu = torch.zeros_like(p.lb_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -235,12 +234,8 @@ class LinearSystemGymEnv(gymnasium.Env):
         """Apply ``action`` ``(n_u,)``, clipped; return the observation, the reward and the flags.
 
         Raises:
-            QPError: if ``reset`` has not been called, or the action does not fit or is not finite.
+            QPError: the action does not fit or is not finite.
         """
-        if self._s is None:
-            raise QPError.expected(
-                "step", "no episode", "one that has started", "Call reset() first."
-            )
         a = checked_action(action, self.action_space)
         reward = -self.physics.cost(self._s, a).item()
         self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])

@@ -69,11 +69,6 @@ class Plant(ABC):
         """Entries of the known signals d_k, .., d_{k+N}."""
         return (self.horizon + 1) * self.n_d
 
-    @property
-    def n_p(self) -> int:
-        """Entries of p, what a controller sees: the known signals, then output or estimate."""
-        return self.n_preview + self.n_x
-
     def to(self, device: torch.device | str | None) -> Self:
         """Return the same plant with its tensors on ``device``."""
         return moved(self, device)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_number, check_seed, check_tensor
+from torch_qpmpc.checks import check_choice, check_number, check_seed, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
@@ -24,7 +24,6 @@ from torch_qpmpc.envs.linear_system import (
     normal,
     uniform,
 )
-from torch_qpmpc.errors import QPError
 
 #: Standard deviation of the noise by kind, which the paper does not specify.
 NOISE_STD = {"gaussian": 0.01, "brownian": 0.002}
@@ -83,9 +82,7 @@ class PointMass(LinearSystem):
         check_tensor("W", self.W, *self.A.shape, batched=False)
         for name in ("start_position", "start_velocity"):
             check_number(name, getattr(self, name), _finite, "a finite number >= 0")
-        if not isinstance(self.noise_kind, str) or self.noise_kind not in NOISE_STD:
-            kinds = " or ".join(map(repr, NOISE_STD))
-            raise QPError.expected("noise_kind", repr(self.noise_kind), kinds, "Choose one.")
+        check_choice("noise_kind", self.noise_kind, tuple(NOISE_STD))
         remedy = "Pass 0 for no noise, None for the default."
         check_number("noise_std", self.std, _finite, "a finite number >= 0", remedy)
 

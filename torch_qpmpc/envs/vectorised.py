@@ -83,14 +83,6 @@ class VectorisedEnv(EnvBase):
         low, high = (b.to(self.dtype).expand(*self.batch_size, -1).clone() for b in (low, high))
         return Bounded(low, high, dtype=self.dtype, device=self.device)
 
-    def get_rng_state(self) -> Tensor:
-        """Return the generator's state, a uint8 tensor for a checkpoint."""
-        return self.rng.get_state()
-
-    def set_rng_state(self, state: Tensor) -> None:
-        """Restore the generator's ``state``, a result of :meth:`get_rng_state`."""
-        self.rng.set_state(state.cpu())
-
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             check_seed(seed)

@@ -31,9 +31,6 @@ from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.state import KIND, stored
 
-#: The parts of a snapshot.
-STATE = ("config", "update", "arguments", "mpc", "loss_module", "optimizer", "scheduler")
-STATE += ("gate", "replay", "collector", "tally", "rng")
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
 #: Keys that may stand beside ``resume``, because they name the run's code.
@@ -111,12 +108,8 @@ def restore(
 def check_state(state: Any, cfg: DictConfig) -> None:
     """Raise `QPError` unless ``state`` is a `snapshot` of a run with the configuration ``cfg``."""
     remedy = "Another version of train.py wrote it: resume with that version, or start a new run."
-    if not isinstance(state, dict):
+    if not isinstance(state, dict) or "config" not in state:
         raise QPError.expected("checkpoint", f"a {type(state).__name__}", "a run's state", remedy)
-    if missing := [key for key in STATE if key not in state]:
-        raise QPError.expected(
-            "checkpoint", f"one without {', '.join(missing)}", "a run's state", remedy
-        )
     if changed := differences(state["config"], settings(cfg)):
         then, now = changed
         remedy = "A run resumes with its own configuration, from its own checkpoints."
@@ -242,7 +235,7 @@ def _collector_state(collector: Collector) -> dict[str, Any] | None:
     return {
         "episodes": collector._carrier.to_dict(),
         "trajectories": collector._traj_pool.state_dict(),
-        "rng": env.get_rng_state(),
+        "rng": env.rng.get_state(),
     }
 
 
@@ -261,4 +254,4 @@ def _restore_collector(collector: Collector, state: dict[str, Any]) -> None:
         raise KeyError(f"no {missing}")
     collector._carrier.update(episodes)
     collector._traj_pool.load_state_dict(state["trajectories"])
-    env.set_rng_state(state["rng"])
+    env.rng.set_state(state["rng"])

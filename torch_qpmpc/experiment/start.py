@@ -179,15 +179,9 @@ def stored_log(path: str | Path) -> TensorDict:
     Raises:
         QPError: the file is missing, damaged, or not a log.
     """
-    path = Path(path)
-    if not path.exists():
-        raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
     try:
-        stored = read_tensors(path)
+        stored = read_tensors(Path(path))
+        return TensorDict(stored, batch_size=stored["action"].shape[:-1])
     except Exception as error:  # damaged files raise errors of any type
-        got = f"{path}, which cannot be read ({type(error).__name__})"
+        got = f"{path}, which cannot be read ({type(error).__name__}: {error})"
         raise QPError.expected("start.file", got, WANTED, FORMAT) from error
-    actions = stored.get("action") if isinstance(stored, dict) else None
-    if not isinstance(actions, Tensor):
-        raise QPError.expected("start.file", f"{path}, without actions", WANTED, FORMAT)
-    return TensorDict(stored, batch_size=actions.shape[:-1])

@@ -115,21 +115,13 @@ class _Course:
     """
 
     def __init__(self, models: Sequence[Innovations]) -> None:
-        courses = [_course(model) for model in models]
-        n, steps = (max(len(part[i]) for part in courses) for i in (0, 5))
-        n_y = len(models[0].C)
-
-        def stack(i: int, *shape: int) -> Tensor:
-            whole = np.zeros((len(models), *shape))
-            for to, part in zip(whole, (part[i] for part in courses), strict=True):
-                to[tuple(map(slice, part.shape))] = part
-                if i > 4:
-                    to[len(part) :] = to[len(part) - 1]
-            return torch.as_tensor(whole)
-
-        self.A, self.B = stack(0, n, n), stack(1, n, models[0].B.shape[1])
-        self.offset, self.C, self.x0 = stack(2, n), stack(3, n_y, n), stack(4, n)
-        self.gains, self.roots = stack(5, steps, n, n_y), stack(6, steps, n_y, n_y)
+        parts = ([getattr(x, name) for x in models] for name in ("A", "B", "offset", "C", "x0"))
+        self.A, self.B, self.offset, self.C, self.x0 = map(_stacked, parts)
+        courses = [[*model.settling(STEPS), (model.L, model.S)] for model in models]
+        longest = max(map(len, courses))
+        courses = [course + course[-1:] * (longest - len(course)) for course in courses]
+        self.gains = _stacked([np.array([L for L, _ in course]) for course in courses])
+        self.roots = _stacked([np.array([_root(V) for _, V in course]) for course in courses])
 
     def at(self, name: str, x: Tensor, k: Tensor | None = None) -> Tensor:
         """Return the product of each loop's matrix, that of step k, and x ``(count, n)``."""
@@ -144,11 +136,11 @@ class _Course:
         return self.at("A", x) + self.at("B", u) + offset
 
 
-def _course(model: Innovations) -> tuple[np.ndarray, ...]:
-    course = [(gain, _root(V)) for gain, V in model.settling(STEPS)]
-    course.append((model.L, _root(model.S)))
-    gains, roots = map(np.array, zip(*course, strict=True))
-    return model.A, model.B, model.offset, model.C, model.x0, gains, roots
+def _stacked(parts: Sequence[np.ndarray]) -> Tensor:
+    """Stack arrays, the smaller ones with zeros at their ends."""
+    shape = np.max([x.shape for x in parts], 0)
+    padded = [np.pad(x, [(0, n) for n in shape - x.shape]) for x in parts]
+    return torch.as_tensor(np.array(padded))
 
 
 def _root(V: np.ndarray) -> np.ndarray:

@@ -222,11 +222,6 @@ def preview_key(mpc: QPMPC) -> str | None:
     return PREVIEW if mpc.n_d else None
 
 
-def known_keys(mpc: QPMPC) -> list[NestedKey]:
-    """Return the keys of p's parts, as environments emit them, in the order of p."""
-    return [PREVIEW, "observation"] if mpc.n_d else ["observation"]
-
-
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
     """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets.
 

@@ -1,7 +1,7 @@
 """The penalties that pull C towards an MPC scheme's: deviation and system identification (SI).
 
-Each is a pure function of C, and a thin module that holds its constants. Both are differentiable
-terms of a Q-learning loss; the deviation penalty also has an exact proximal step.
+Both are differentiable terms of a Q-learning loss; the deviation penalty also has an exact proximal
+step.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.layout import Layout
@@ -22,33 +22,6 @@ WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
 
 def _finite(x: float) -> bool:
     return 0 <= x < torch.inf
-
-
-def deviation_penalty(C: Tensor, C_0: Tensor, C_mask: Tensor) -> Tensor:
-    """Return the scalar ``sum |C_mask * (C - C_0)|`` (eq:sdp2) of C, C_0, C_mask ``(n_c, n_z)``."""
-    return (C_mask * (C - C_0)).abs().sum()
-
-
-def system_identification_penalty(C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
-    """Return ``sum_i ||C tau_i - b||^2`` (eq:sdp3, where b is zero), a scalar.
-
-    C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
-    lowers the penalty.
-
-    Args:
-        C: ``(n_c, n_z)``.
-        windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``. With a preview, s_j is p at
-            step j.
-        b: ``(n_c,)``; None for zero.
-
-    Raises:
-        QPError: if a shape does not fit.
-    """
-    check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
-    check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
-    b = C.new_zeros(len(C)) if b is None else b
-    check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
-    return (windows.to(C.dtype) @ C.mT - b).square().sum()
 
 
 class DeviationPenalty(nn.Module):
@@ -94,21 +67,15 @@ class DeviationPenalty(nn.Module):
         super().__init__()
         for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
             check_number(name, weight, _finite, "a finite weight >= 0")
-        check_whole("n_x", n_x, 1)
-        check_whole("n_u", n_u, 1)
-        check_whole("n_d", n_d, 0)
         remedy = "Pass the C_0 of a QPMPC."
         check_tensor("C_0", ungraded("C_0", C_0), "N n_x", "n_z", batched=False, remedy=remedy)
         if not C_0.isfinite().all():
             raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
-        horizon = max(C_0.shape[0] // n_x, 1)
+        horizon = max(len(C_0) // max(n_x, 1), 1)
         distance = band_distance(Layout(n_x, n_u, horizon, n_d)).to(C_0)
         if distance.shape != C_0.shape:
-            raise QPError.expected(
-                "C_0",
-                f"shape {tuple(C_0.shape)}",
-                f"shape {tuple(distance.shape)} for N = {horizon}",
-            )
+            want = f"shape {tuple(distance.shape)} for N = {horizon}"
+            raise QPError.expected("C_0", f"shape {tuple(C_0.shape)}", want)
         mask = torch.full_like(distance, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
         self.register_buffer("C_0", C_0.detach().clone())
@@ -126,7 +93,7 @@ class DeviationPenalty(nn.Module):
     def forward(self, C: Tensor) -> Tensor:
         """Return the penalty of C ``(N n_x, n_z)``, a scalar."""
         check_tensor("C", C, *self.C_0.shape, batched=False, remedy="Pass mpc.C.")
-        return deviation_penalty(C, self.C_0, self.C_mask)
+        return (self.C_mask * (C - self.C_0)).abs().sum()
 
     @torch.no_grad()
     def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
@@ -158,6 +125,9 @@ class DeviationPenalty(nn.Module):
 
 class SystemIdentificationPenalty(nn.Module):
     """The system-identification (SI) penalty ``beta sum_i ||C tau_i - b||^2`` (eq:sdp3).
+
+    C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
+    lowers the penalty.
 
     Args:
         beta: weight of the penalty.
@@ -192,5 +162,15 @@ class SystemIdentificationPenalty(nn.Module):
         return 2 * self.beta * tau.mT @ tau
 
     def forward(self, C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
-        """Return the penalty of C ``(n_c, n_z)`` and b ``(n_c,)`` on windows ``(M, n_z)``."""
-        return self.beta * system_identification_penalty(C, windows, b)
+        """Return the penalty of C ``(n_c, n_z)`` and b on windows ``(M, n_z)``, a scalar.
+
+        Args:
+            C: ``(n_c, n_z)``.
+            windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}]. With a preview, s_j is p at step j.
+            b: ``(n_c,)``; None for zero.
+        """
+        check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
+        check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
+        b = C.new_zeros(len(C)) if b is None else b
+        check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
+        return self.beta * (windows.to(C.dtype) @ C.mT - b).square().sum()

@@ -298,13 +298,6 @@ class QPQLearningLoss(LossModule):
                 raise QPError.expected(str(path), got, want, remedy)
             if dtype is not None and value.dtype != dtype:
                 raise QPError.expected(str(path), value.dtype, dtype, "Convert it: .bool().")
-        following: TensorDictBase = tensordict.get("next")
-        for key in self.state_value_network.in_keys:
-            if following.get(key, None) is None:
-                present = ", ".join(sorted(str(name) for name in following.keys(True, True)))
-                remedy = "Collect the next observations, or set the operator's keys."
-                name, got = str(unravel_key(("next", key))), f"a TensorDict with {present}"
-                raise QPError.expected(name, got, f"one with {key}", remedy)
         if 0 in tensordict.batch_size:
             raise QPError.expected("tensordict", "an empty batch", "at least one transition")
 

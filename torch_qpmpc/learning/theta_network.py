@@ -14,7 +14,7 @@ from torchrl.modules import MLP
 
 from torch_qpmpc.checks import check_kind, check_number, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.operators import entry, known_keys
+from torch_qpmpc.learning.operators import PREVIEW, entry
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import check_names
 
@@ -79,7 +79,7 @@ class ThetaNetwork(TensorDictModuleBase):
         self.sizes = {name: float(size) for name, size in sizes.items()}
         self.shapes = {name: known[name].shape for name in sizes}
         self.theta_keys: dict[str, NestedKey] = {name: ("theta", name) for name in sizes}
-        keys = known_keys(mpc) if in_keys is None else in_keys
+        keys = (*[PREVIEW] * (mpc.n_d > 0), "observation") if in_keys is None else in_keys
         if not isinstance(keys, Sequence) or isinstance(keys, str) or not keys:
             raise QPError.expected("in_keys", repr(keys), "a list of keys, such as ['observation']")
         self.in_keys = list(keys)  # pyright: ignore[reportAttributeAccessIssue]

@@ -68,10 +68,10 @@ class Cost:
     def hessians(
         self, layout: Layout, A: Tensor, B: Tensor, gamma: float, random: torch.Generator
     ) -> dict[str, Tensor]:
-        """Return H and H_f in the shapes for ``hessian``; only H if it is full.
+        """Return H and H_f of the sizes ``layout`` in the shapes for ``hessian``; a full H alone.
 
-        A terminal weight of the regulator is that of A, B and gamma; ``random`` draws a stage
-        weight that is None.
+        A terminal weight of the regulator is that of ``A``, ``B`` and ``gamma``; ``random`` draws a
+        stage weight that is None.
 
         Raises:
             QPError: a shape does not match the sizes, or a weight is not positive semidefinite.

@@ -155,9 +155,11 @@ class Layout:
 
     def stage_blocks(self, rows: Tensor) -> Tensor:
         """Return the entries of rows ``(N i, n_z)`` at d_k, x_k, u_k, ``(N, i, n_d + n)``."""
-        d = _diagonal_blocks(rows, self.horizon, 0, self.n_d, self.n_d)
-        plan = _diagonal_blocks(rows, self.horizon, self.n_preview, self.n, self.n)
-        return torch.cat((d, plan), dim=-1)
+        k = torch.arange(self.horizon, device=rows.device)[:, None, None]
+        d, plan = (n * k + torch.arange(n, device=rows.device) for n in (self.n_d, self.n))
+        columns = torch.cat((d, self.n_preview + plan), dim=-1)
+        blocks = rows.unflatten(0, (self.horizon, len(rows) // self.horizon))
+        return blocks.gather(-1, columns.expand(-1, blocks.shape[1], -1))
 
     def terminal_block(self, rows: Tensor) -> Tensor:
         """Return the entries of rows ``(i, n_z)`` at d_N and x_N, ``(i, n_d + n_x)``."""
@@ -231,11 +233,3 @@ def read_blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
         remedy = "The last one may hold its actions to the end."
         raise QPError.expected("blocks", repr(blocks), want, remedy)
     return (*sizes,)
-
-
-def _diagonal_blocks(rows: Tensor, count: int, first: int, width: int, step: int) -> Tensor:
-    """Return of each of ``count`` blocks of rows the columns ``first + k step + [0, width)``."""
-    start = first + step * torch.arange(count, device=rows.device)
-    columns = (start.unsqueeze(-1) + torch.arange(width, device=rows.device)).unsqueeze(1)
-    blocks = rows.unflatten(0, (count, len(rows) // count))
-    return blocks.gather(-1, columns.expand(-1, blocks.shape[1], -1))

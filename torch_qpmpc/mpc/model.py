@@ -71,7 +71,7 @@ class Model:
         return Layout(self.B.shape[-2], self.B.shape[-1], horizon, n_d)
 
     def matrices(self, layout: Layout, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Return A, B and E of the sizes ``layout``; those that are None are random, E is zero.
+        """Return A, B and E of the sizes ``layout``; A or B that is None is drawn by ``random``.
 
         Raises:
             QPError: a shape does not match the sizes.

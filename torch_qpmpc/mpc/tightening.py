@@ -20,7 +20,7 @@ import torch
 from scipy.special import ndtri
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_number, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
@@ -38,21 +38,12 @@ def prediction_covariance(
         horizon: N.
         initial: covariance of the error of x_0, ``(n_x, n_x)``; zero by default.
 
-    Raises:
-        QPError: a shape does not fit.
-
     Example:
         >>> one = torch.ones(1, 1)
         >>> prediction_covariance(one, 0.5 * one, 4).flatten()
         tensor([0.0000, 0.5000, 1.0000, 1.5000, 2.0000])
     """
-    check_whole("horizon", horizon, 0)
-    check_tensor("A", A, "n_x", "n_x", batched=False)
-    n_x = len(A)
-    check_tensor("A", A, n_x, n_x, batched=False)
-    check_tensor("W", W, n_x, n_x, batched=False)
     covariances = [torch.zeros_like(W) if initial is None else initial]
-    check_tensor("initial", covariances[0], n_x, n_x, batched=False)
     for _ in range(horizon):
         covariances.append(A @ covariances[-1] @ A.mT + W)
     return torch.stack(covariances)
