@@ -158,7 +158,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("gamma: got 2.0, expected a", lambda: qm.QPQLearningLoss(op).make_value_estimator(gamma=2.0)),
     ("('next', 'reward'): got no such entry, expected one of shape (3,", lost(("next", "reward"))),
     ("('next', 'done'): got no such entry", lost(("next", "done"), ("next", "terminated"))),
-    ("observation: got a TensorDict with done, reward", lost(("next", "observation"))),
+    ("observation: got a TensorDict with no entry, expected", lost(("next", "observation"))),
     ("('next', 'reward'): got shape (3,)", with_entry(("next", "reward"), zeros(3).double())),
     ("('next', 'terminated'): got torch.float32", with_entry(("next", "terminated"), zeros(3, 1))),
     ("('next', 'terminated'): got shape (3,)", with_entry(("next", "terminated"), zeros(3).bool())),

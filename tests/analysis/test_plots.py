@@ -47,7 +47,7 @@ def test_a_C_without_canonical_form_is_an_error():
         canonical_figure(mpc)
 
 
-def test_the_policy_figure_has_four_panels_and_the_regions_borders():
+def test_the_policy_figure_has_four_panels():
     grid = torch.linspace(-1, 1, 9)
     found = policy_map(make_mpc(), grid, grid[:7], axes=(0, 2))
     figure = policy_figure(found, action=1)
@@ -56,9 +56,6 @@ def test_the_policy_figure_has_four_panels_and_the_regions_borders():
         assert np.isfinite(np.asarray(mesh.get_array())).all()
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("$s_{1}$", "$s_{3}$")
     assert f"{len(found.active_sets)} regions" in figure.axes[3].get_title()
-    crossings = sum(int((found.regions.diff(dim=axis) != 0).sum()) for axis in (0, 1))
-    lines = figure.axes[3].lines
-    assert sum(int(np.isnan(line.get_xdata()).sum()) for line in lines) == crossings > 0
     rendered(figure)
 
 

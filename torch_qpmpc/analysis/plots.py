@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -136,12 +135,10 @@ def _draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **styl
 
 
 def _draw_regions(axes: Axes, mapped: PolicyMap) -> None:
-    """Draw the regions of one active set each, with their borders; colours repeat."""
+    """Draw the regions of one active set each; colours repeat."""
     title = f"Active sets: {len(mapped.active_sets)} regions on this grid"
     colours = (mapped.regions % 20).double().masked_fill(mapped.regions < 0, torch.nan)
     _draw_slice(axes, mapped, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
-    for line in _borders(mapped):
-        axes.plot(*line, color="black", linewidth=0.5, alpha=0.6)
 
 
 def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
@@ -165,34 +162,6 @@ def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
         figure.colorbar(image, ax=axes, shrink=0.85)
     _draw_regions(sets, mapped)
     return figure
-
-
-def _borders(mapped: PolicyMap) -> list[tuple[list[float], list[float]]]:
-    """Return the segments between grid points of different active sets, as one line per axis.
-
-    A line is a pair of coordinate lists, with nan between the segments.
-    """
-    edges = [_edges(axis) for axis in (mapped.x, mapped.y)]
-    lines = []
-    for axis in (0, 1):
-        across, along = edges[axis], edges[1 - axis]
-        regions = mapped.regions if axis == 0 else mapped.regions.mT
-        at: list[float] = []
-        along_at: list[float] = []
-        for i, j in (regions[1:] != regions[:-1]).nonzero().tolist():
-            at += [across[i + 1], across[i + 1], float("nan")]
-            along_at += [along[j], along[j + 1], float("nan")]
-        lines.append((at, along_at) if axis == 0 else (along_at, at))
-    return lines
-
-
-def _edges(points: Tensor) -> list[float]:
-    """Return the midpoints of neighbours, and points as far beyond the first and the last."""
-    values = points.tolist()
-    if len(values) == 1:
-        return [values[0] - 0.5, values[0] + 0.5]
-    middle = [(a + b) / 2 for a, b in pairwise(values)]
-    return [2 * values[0] - middle[0], *middle, 2 * values[-1] - middle[-1]]
 
 
 @without_gradients

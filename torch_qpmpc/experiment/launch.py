@@ -109,17 +109,13 @@ def locked(folder: str | Path, elsewhere: str) -> Iterator[None]:
     Raises:
         QPError: another run holds the lock; the setting ``elsewhere`` chooses another folder.
     """
-    lock = FileLock(Path(folder) / LOCK)
     try:
-        lock.acquire(timeout=0)
+        with FileLock(Path(folder) / LOCK, timeout=0):
+            yield
     except Timeout:
         remedy = f"Wait until that run has ended, or choose another folder with {elsewhere}."
         got, want = f"{folder}, in use by another process", "one that no run is using"
         raise QPError.expected("folder", got, want, remedy) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 class Interrupt:

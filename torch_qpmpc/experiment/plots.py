@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import LogLocator, NullLocator
 from omegaconf import DictConfig
 from torch import Tensor
 
@@ -114,10 +114,8 @@ def scale_costs(axes: Axes) -> None:
     if not 0 < low < high / 1.5:
         return
     axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    steps = (1, 1.5, 2, 3, 5, 7)
-    ticks = [s * 10**k for k in range(-2, 5) for s in steps if low <= s * 10**k <= high]
-    axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_locator(NullLocator())
 
 

@@ -42,12 +42,9 @@ class RunFolder:
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
         # Read before the first event is written: damaged rows stop the run.
-        earlier: Any = None if after is None else _read_until(self.path, cfg, after)
+        earlier: Any = () if after is None else _read_until(self.path, cfg, after).iterrows()
+        self.rows: list[dict[str, float]] = [{"update": k, **row.dropna()} for k, row in earlier]
         self.cfg = cfg
-        self.rows: list[dict[str, float]] = []
-        if after is not None:
-            for update, row in earlier.iterrows():
-                self.rows.append({"update": update, **row.dropna()})
         self.logger = make_logger(cfg, self.path)
         if after is None:
             text = OmegaConf.to_yaml(cfg, resolve=True)
