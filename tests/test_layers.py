@@ -66,10 +66,10 @@ LAYERS = {
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 435,
-    "analysis": 1094,
+    "analysis": 1063,
     "control": 4309,
     "envs": 1502,
-    "experiment": 3622,
+    "experiment": 3613,
     "export": 1430,
     "learning": 2831,
     "mpc": 5365,
