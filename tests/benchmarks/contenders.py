@@ -112,7 +112,7 @@ def _ours() -> list[Contender]:
 
 
 #: Largest batch of peers for which larger ones take minutes.
-PATIENCE = {"qpth": 256, "cvxpylayers": 256}
+PATIENCE = {"qpth": 256, "cvxpylayers": 256, "Moreau": 256}
 
 CONTENDERS: list[Contender] = [
     *(

@@ -1,10 +1,11 @@
 """One decision at a time: `predict` and `Controller.step` beside raw solvers of the same QPs.
 
-    pip install osqp clarabel && python -m tests.benchmarks.one_state --write
+    pip install osqp clarabel casadi && python -m tests.benchmarks.one_state --write
 
 CPU time of each step of a closed loop with noise and kicks, in blocks in which the contenders take
 turns: the median and the largest of `STEPS`. "Default threads" are torch's own number. A package
-that is not installed is left out; Clarabel, which sets each QP up again, gets `FEW` steps.
+that is not installed is left out. Clarabel, which sets each QP up again, and CasADi get `FEW`
+steps.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers.daqp import NO_BOUND, RECIPROCAL_RHO, SOFT
 from torch_qpmpc.study.markdown import replaced, table
 
-STEPS, FEW, BLOCK, KICK = 2_000, 200, 200, 50
+STEPS, FEW, BLOCK, KICK = 10_000, 200, 200, 50
 SIZES = {"N = 10, 2 states": (10, 2, 1), "N = 50, 8 states": (50, 8, 2)}
 EPS = 1e-6
 Step = Callable[[int], Any]
@@ -97,6 +98,25 @@ def clarabel_step(full: FullSpace) -> Step:
     return step
 
 
+def casadi_step(full: FullSpace) -> Step:
+    """Make CasADi's own sparse active-set method, QRQP, warm-started."""
+    casadi = needs("casadi")
+    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
+    Q = casadi.DM(sp.csc_matrix(full.Q.detach().numpy()))
+    A = casadi.DM(sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy()))
+    quiet = {"print_iter": False, "print_header": False, "print_info": False}
+    solver = casadi.conic("step", "qrqp", {"h": Q.sparsity(), "a": A.sparsity()}, quiet)
+    start: dict[str, Any] = {}
+
+    def step(k: int) -> np.ndarray:
+        bounds = {"lba": np.hstack((b[k], lower[k])), "uba": np.hstack((b[k], upper[k]))}
+        found = solver(h=Q, g=p[k], a=A, **bounds, **start)
+        start.update(x0=found["x"], lam_a0=found["lam_a"])
+        return np.array(found["x"])
+
+    return step
+
+
 def daqp_step(mpc: qm.QPMPC, states: np.ndarray) -> Step:
     """Make DAQP on our condensed QPs, warm-started, without the certificate."""
     operands = *mpc.quadratic_program().tensors(), torch.from_numpy(states)
@@ -122,7 +142,7 @@ def measured(steps: dict[str, Step], default: int) -> dict[str, np.ndarray]:
         step(0)
     for start in range(0, STEPS, BLOCK):
         for name, step in steps.items():
-            if start >= FEW and name == "Clarabel":
+            if start >= FEW and name in ("Clarabel", "CasADi (QRQP)"):
                 continue
             torch.set_num_threads(default if "default" in name else 1)
             for k in range(start, start + BLOCK):
@@ -143,6 +163,8 @@ def of_policy(N: int, n_x: int, n_u: int, default: int) -> dict[str, np.ndarray]
     steps["raw DAQP, no certificate"] = daqp_step(mpc, states)
     if find_spec("osqp"):
         steps["OSQP"] = osqp_step(full)
+    if find_spec("casadi") and N == 10:  # at 50 it ends without a solution
+        steps["CasADi (QRQP)"] = casadi_step(full)
     if find_spec("clarabel"):
         steps["Clarabel"] = clarabel_step(full)
     compiled = qm.CompiledPolicy(mpc)
@@ -191,11 +213,11 @@ def main(arguments: list[str] | None = None) -> int:
             times = 1e3 * column[name] if name in column else None
             cells.append("" if times is None else " / ".join(map(significant, spread(times))))
         lines.append([name, *cells])
-    packages = ("torch", "daqp", "osqp", "clarabel")
+    packages = ("torch", "daqp", "osqp", "clarabel", "casadi")
     versions = ", ".join(f"{name} {version(name)}" for name in packages if find_spec(name))
     text = (
-        f"CPU milliseconds of a step, median / largest of {STEPS:,} (Clarabel: {FEW}), with "
-        f"{versions}; one thread unless a row says default threads, here {default} on "
+        f"CPU milliseconds of a step, median / largest of {STEPS:,} (Clarabel, CasADi: {FEW}), "
+        f"with {versions}; one thread unless a row says default threads, here {default} on "
         f"{os.cpu_count()} cores.\n\n{table(['', *columns], lines)}"
     )
     print(text)

@@ -116,11 +116,37 @@ def clarabel() -> Values:
     return values
 
 
+def moreau() -> Values:
+    """Make Moreau's torch layer, at its default tolerances, for each size of a batch."""
+    package, Solver = needs("moreau"), needs("moreau.torch").Solver
+    layers: dict[torch.Size, Any] = {}
+
+    def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
+        full = FullSpace.of(qp, fixed)
+        G, h = full.one_sided()
+        matrices = full.Q, torch.cat((full.A, G))
+        if fixed.shape not in layers:
+            # Entries that are zero today, of G and of the diagonal of H, are learned, too.
+            masks = [(full.Q != 0) | torch.eye(len(full.Q), dtype=torch.bool)]
+            masks.append(torch.ones_like(matrices[1], dtype=torch.bool))
+            patterns = [sp.csr_matrix(mask.numpy()) for mask in masks]
+            places = [torch.from_numpy(x) for P in patterns for x in (P.indptr, P.indices)]
+            cones = package.Cones(num_zero_cones=len(full.A), num_nonneg_cones=len(G))
+            settings = package.Settings(device="cpu", solver="active_set", batch_size=len(fixed))
+            layers[fixed.shape] = masks, Solver(*reversed(masks[1].shape), *places, cones, settings)
+        masks, layer = layers[fixed.shape]
+        P, A = (x[mask] for x, mask in zip(matrices, masks, strict=True))
+        return full.value(layer.solve(P, A, full.p, torch.cat((full.b, h), dim=1)).x)
+
+    return values
+
+
 PEERS: dict[str, Callable[[], Values]] = {
     "ProxSuite's QPFunction": proxsuite,
     "qpth": qpth,
     "cvxpylayers": cvxpylayers,
     "Clarabel through qpsolvers": clarabel,
+    "Moreau": moreau,
 }
 
 
