@@ -70,7 +70,7 @@ BUDGET = {
     "control": 4309,
     "envs": 1502,
     "experiment": 3613,
-    "export": 1430,
+    "export": 1436,
     "learning": 2831,
     "mpc": 5365,
     "proofs": 1003,

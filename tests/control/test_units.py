@@ -9,7 +9,7 @@ import pytest
 import scipy.signal
 
 import torch_qpmpc as qm
-from tests.campaign.units import judged
+from tests.campaign.units import drawn, judged
 from torch_qpmpc import QPError
 from torch_qpmpc.control.lowering import riccati
 
@@ -171,3 +171,8 @@ def test_a_plant_without_a_steady_state_is_refused_in_any_unit():
 @pytest.mark.parametrize("seed", [0, 5, 12, 15, 49])
 def test_random_designs_in_random_units_have_the_same_moves(seed):
     assert judged(seed, compiled=seed == 0)[0].startswith("controlled")
+
+
+def test_a_target_whose_value_is_the_rest_of_huge_terms_is_exported(tmp_path):
+    design, units = drawn(22)
+    assert qm.export_c(design.made(units).targets, tmp_path).rows == 0

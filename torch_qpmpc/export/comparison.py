@@ -274,8 +274,10 @@ def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference
             "See mpc.solve(s): hard rows may contradict each other; a finite slack softens them."
         )
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
+    H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
+    terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
     examples = [
-        Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]))
+        Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]), float(terms[i]))
         for kind, indices in chosen.items()
         for i in indices
     ]

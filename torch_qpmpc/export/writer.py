@@ -54,6 +54,8 @@ CONSTANTS = {
 }
 #: Largest differences in the self-test, relative to the largest expected action and value.
 NEAR = {"float64": Near(1e-6, 1e-8), "float32": Near(1e-3, 1e-4)}
+#: The rounding of a value, in units in the last place of its terms, which may cancel.
+ROUNDING = 64
 REAL = {"float64": "double", "float32": "float"}
 WIDTH = 100
 
@@ -62,13 +64,14 @@ Labels = Mapping[str, Sequence[str]]
 
 
 class Example(NamedTuple):
-    """A state of the self-test: p, and the expected code, u and value."""
+    """A state of the self-test: p, and the expected code, u and value, of terms of a size."""
 
     kind: str
     p: Array
     code: int
     u: Array
     value: float
+    terms: float = 0.0
 
 
 class Examples(NamedTuple):
@@ -264,7 +267,8 @@ def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
         "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in states]).reshape(-1, tables.n_u),
         "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in states]),
         "NEAR_U": near.u * examples.u,
-        "NEAR_VALUE": near.value * np.fmax([abs(e.value) for e in states], examples.value),
+        "NEAR_VALUE": near.value * np.fmax([abs(e.value) for e in states], examples.value)
+        + ROUNDING * np.finfo(dtype).eps * np.array([e.terms for e in states]),
     }
     return "\n".join(
         [
