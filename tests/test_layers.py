@@ -69,13 +69,13 @@ BUDGET = {
     "analysis": 1063,
     "control": 4309,
     "envs": 1502,
-    "experiment": 3613,
+    "experiment": 3609,
     "export": 1436,
     "learning": 2831,
-    "mpc": 5365,
+    "mpc": 5359,
     "proofs": 1003,
     "qp": 5934,
-    "study": 614,
+    "study": 611,
 }
 #: Libraries that only some layers may import.
 RESERVED = {

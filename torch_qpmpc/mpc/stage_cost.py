@@ -85,14 +85,8 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     It is ridge regression about a typical v, in units in which columns have unit variance. The
     strength is a thousandth of the evidence's (`ridge`), and vanishes for a cost without noise; of
     collinear columns it takes the smallest coefficients. A W that is not positive semidefinite is
-    replaced by the best one that is.
-
-    Args:
-        v: the arguments of the cost, ``(m, n)``.
-        cost: the observed costs, ``(m,)``.
-        n_free: the number of first entries of v, such as d, whose rows and columns of W
-            have any sign; they are zero in a diagonal W.
-        diagonal: fit a diagonal W.
+    replaced by the best one that is. The rows and columns of the first ``n_free`` entries of v
+    ``(m, n)``, such as d, have any sign; they are zero in a ``diagonal`` W. ``cost`` is ``(m,)``.
 
     Raises:
         QPError: there are no rows, or entries that are not finite or too large.

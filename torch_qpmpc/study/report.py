@@ -123,12 +123,9 @@ def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
 def main(arguments: list[str] | None = None) -> None:
     about = "Write tables and figures of finished runs."
     parser = argparse.ArgumentParser(prog="python -m torch_qpmpc.report", description=about)
-    parser.add_argument(
-        "folder", type=Path, metavar="RUNS_FOLDER", help="folder of the runs, at any depth"
-    )
-    parser.add_argument(
-        "--page", type=Path, help="Markdown file whose <!-- RUNS_FOLDER --> section gets the tables"
-    )
+    parser.add_argument("folder", type=Path, metavar="RUNS_FOLDER", help="runs at any depth")
+    page = "Markdown file whose <!-- RUNS_FOLDER --> section gets the tables"
+    parser.add_argument("--page", type=Path, help=page)
     options = parser.parse_args(arguments)
     try:
         frame = collect(options.folder)

@@ -120,12 +120,8 @@ def plant_scheme(
 ) -> Scheme:
     """Make the scheme of a model and a weight with the settings of ``cfg.task``.
 
-    Args:
-        cfg: the configuration.
-        plant: gives the sizes and the bounds.
-        model: see `torch_qpmpc.Model`.
-        stage_weight: W of the cost 1/2 [x; u]' W [x; u], or its diagonal.
-        state_bounds: by default the bounds of the plant; a `Plant` has none.
+    ``stage_weight`` is W of the cost 1/2 [x; u]' W [x; u], or its diagonal. ``plant`` gives the
+    sizes and the bounds; a `Plant` has no ``state_bounds`` by itself.
     """
     if state_bounds is None and not isinstance(plant, Plant):
         state_bounds = plant.lb_s, plant.ub_s
