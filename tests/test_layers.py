@@ -70,7 +70,7 @@ BUDGET = {
     "control": 4309,
     "envs": 1502,
     "experiment": 3609,
-    "export": 1436,
+    "export": 1441,
     "learning": 2831,
     "mpc": 5359,
     "proofs": 1003,

@@ -207,7 +207,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     Those nearest to reaching the bounds come first. An entry's size is a quantile, at most the
     median, over the rows that contain it, of that at which the row without multipliers is at its
     nearest bound: rows of late stages reach theirs for absurd p only. It is one for an entry
-    without an effect. Constants stay, and p satisfies hard rows with equal bounds.
+    without an effect on them, and `Tables.usual` without any row. Constants stay, and p satisfies
+    hard rows with equal bounds.
     """
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
@@ -215,7 +216,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     span = np.where(np.isfinite(upper - lower), upper - lower, 0.0)  # a centre may be at a bound
     distances = (np.abs(x - Y @ tables.centre) for x in (lower, upper))
     near = np.minimum(*(np.where(x > CENTRED * span, x, np.inf) for x in distances))
-    quantiles, scale = rng.uniform(0, 0.5, count), np.ones((count, tables.n_p))
+    quantiles = rng.uniform(0, 0.5, count)
+    scale = np.tile(np.ones(tables.n_p) if len(Y) else tables.usual, (count, 1))
     rounding = 1e-13 * np.abs(Y).max(initial=0)  # of entries without an effect
     for j, column in enumerate(np.abs(Y).T):
         reaches = np.isfinite(near) & (column > max(1e-9 * column.max(initial=0), rounding))

@@ -77,6 +77,7 @@ class Tables:
         u_lower, u_upper: ``(n_u,)``, the hard bounds of rows that contain one action only.
         condition: the condition number of H_v in an orthonormal basis of the plan.
         centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
+        usual: ``(n_p,)``, the size of an entry of p whose own cost is a half, one without a cost.
         constants: entries of p with one value only.
         digest: SHA-256 of the nine tensors of the QP.
     """
@@ -97,6 +98,7 @@ class Tables:
     u_upper: Array
     condition: float
     centre: Array
+    usual: Array
     constants: dict[int, float]
     digest: str
 
@@ -153,7 +155,7 @@ def make_tables(mpc: QPMPC) -> Tables:
     known = _with(known, _implied(C, T_p, z_b, b))
     u = slice(n_p, n_p + n_u)
     u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
-    of_u = units[u]
+    of_u, own = units[u], H.diagonal()[:n_p]
     return Tables(
         n_p,
         n_u,
@@ -171,6 +173,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         u_upper,
         condition,
         _centre(qp, n_p, mpc.constants),
+        np.where(own > 0, own, 1.0) ** -0.5,
         mpc.constants,
         digest(qp),
     )
