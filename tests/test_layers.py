@@ -69,7 +69,7 @@ BUDGET = {
     "analysis": 1063,
     "control": 4309,
     "envs": 1502,
-    "experiment": 3609,
+    "experiment": 3613,
     "export": 1441,
     "learning": 2831,
     "mpc": 5359,

@@ -214,11 +214,8 @@ def test_damaged_logs_are_named(tmp_path):
     cfg = make_config(*DATA, f"start.file={tmp_path / 'log.pt'}")
     physics = make_physics(cfg)
     for content, message in (
-        (None, r"start\.file: got .*log\.pt, .*No such file.*, expected a log\.pt that"),
-        (
-            {"observation": torch.zeros(3)},
-            r"start\.file: got .*log\.pt, .*KeyError: 'action'.*, expected",
-        ),
+        (None, r"start\.file: got .*log\.pt, which does not exist, expected a log\.pt that"),
+        ({"observation": torch.zeros(3)}, r"start\.file: got .*log\.pt, without actions, expected"),
         (b"text", r"start.file: got .*log\.pt, which cannot be read"),
     ):
         if isinstance(content, bytes):

@@ -179,9 +179,13 @@ def stored_log(path: str | Path) -> TensorDict:
     Raises:
         QPError: the file is missing, damaged, or not a log.
     """
+    if not Path(path).exists():
+        raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
     try:
         stored = read_tensors(Path(path))
-        return TensorDict(stored, batch_size=stored["action"].shape[:-1])
     except Exception as error:  # damaged files raise errors of any type
-        got = f"{path}, which cannot be read ({type(error).__name__}: {error})"
+        got = f"{path}, which cannot be read ({type(error).__name__})"
         raise QPError.expected("start.file", got, WANTED, FORMAT) from error
+    if not isinstance(stored, dict) or not isinstance(stored.get("action"), Tensor):
+        raise QPError.expected("start.file", f"{path}, without actions", WANTED, FORMAT)
+    return TensorDict(stored, batch_size=stored["action"].shape[:-1])
