@@ -229,3 +229,5 @@ def test_the_policy_without_gradients_is_as_fast_and_forgets_earlier_states(dtyp
     assert_close(torch.stack(first), batch, atol=1e-6, rtol=1e-5)
     assert first[0].dtype == dtype
     assert mpc.policy(s[0]).requires_grad
+    with torch.no_grad(), pytest.raises(QPError, match=r"^s: got list, expected a floating"):
+        mpc.policy([0.1, 0.2])  # pyright: ignore[reportArgumentType]

@@ -212,7 +212,8 @@ class Design:
             target: x_s, u_s and y_s, with a dimension for the stages if references are previewed.
             known, level: ``(*batch, N + 1, n_d)`` and ``(*batch, n_d)``.
         """
-        acts, nominal, of_y, of_u = (arrays.asarray(index) for index in self._indices)
+        signals = self.acts, self.nominal, *self.bounded_places
+        acts, nominal, of_y, of_u = map(arrays.asarray, signals)
         known = known - (level * acts + nominal)[..., None, :]
         if self.references == "preview":
             _, u_r, y_r = target
@@ -225,10 +226,15 @@ class Design:
         return arrays.concatenate((*parts, arrays.ones_like(x[..., :1])), -1)
 
     @cached_property
-    def _indices(self) -> tuple[Array, ...]:
-        """Known signals that act on the plant, `nominal`, and the bounded outputs and inputs."""
+    def acts(self) -> Array:
+        """One for known signals that act on the plant, else zero, ``(n_d,)``."""
+        return self.plant.E.any(0).astype(float)
+
+    @cached_property
+    def bounded_places(self) -> tuple[Array, Array]:
+        """The places of the outputs and of the inputs with bounds."""
         of_y, of_u = map(np.flatnonzero, self.bounded)
-        return self.plant.E.any(0).astype(float), self.nominal, of_y, of_u
+        return of_y, of_u
 
     def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
         """Return rows D with lower and upper bounds, and the place of the signal of each.
@@ -327,16 +333,13 @@ def read_limits(
             raise QPError.expected(name, repr(signal), "numbers or known signals", remedy)
         _check_apart(name, signal, plant)
     pairs = bounds if isinstance(bounds, Mapping) else dict.fromkeys(names, tuple(bounds))
-    if any(not isinstance(pair, Sequence) or len(pair) != 2 for pair in pairs.values()):
-        raise QPError.expected(name, repr(dict(pairs)), "pairs (lower, upper) by name")
-    numbers = {
-        key: [None if isinstance(x, str) else x for x in pair] for key, pair in pairs.items()
-    }
-    limits = {
-        key: (lower if isinstance(lower, str) else "", upper if isinstance(upper, str) else "")
-        for key, (lower, upper) in pairs.items()
-    }
-    return numbers, {key: pair for key, pair in limits.items() if any(pair)}
+    numbers: dict[str, Any] = dict(pairs)
+    limits: dict[str, Any] = {}
+    for key, pair in pairs.items():
+        if signals_of({key: pair}):
+            numbers[key] = [None if isinstance(x, str) else x for x in pair]
+            limits[key] = tuple(x if isinstance(x, str) else "" for x in pair)
+    return numbers, limits
 
 
 def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:

@@ -286,7 +286,7 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop) -> dict[str, str]:
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
     tables = [array(key, x, dtype) for key, x in _tables(law, dtype).items()]
     indices = {
-        f"OF_{key}": np.flatnonzero(mask) for key, mask in zip("YU", design.bounded, strict=True)
+        f"OF_{key}": places for key, places in zip("YU", design.bounded_places, strict=True)
     } | dict(zip(("LOWER_OF", "UPPER_OF"), design.limited[1], strict=True))
     tables += [
         f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
@@ -353,7 +353,7 @@ def _tables(law: Law, dtype: str) -> dict[str, Array]:
         **{key.upper(): x for key, x in law.observer._asdict().items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
-        "ACTS": design.plant.E.any(0).astype(float),
+        "ACTS": design.acts,
         "NOMINAL": design.nominal,
         "U_LOWER": design.u_bounds[0],
         "U_UPPER": design.u_bounds[1],

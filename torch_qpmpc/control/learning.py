@@ -1,7 +1,7 @@
 """`Controller.learn`: a model from a closed loop or a log, kept if closed loops cost less with it.
 
-The candidate is the controller with an ARX model that is identified from the transitions, in its
-observer, its target and its plan. Its weights, bounds and names are the same. Paired closed loops,
+The candidate is the controller with a state-space model that is identified from the transitions,
+in its observer, its target and its plan. Its weights, bounds and names are the same. Paired loops,
 with the same set-points and noise for both, decide (`torch_qpmpc.learning.gate.PairedTest`).
 """
 

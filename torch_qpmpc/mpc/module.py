@@ -335,12 +335,14 @@ class QPMPC(nn.Module):
 
         ``warm_start``, ``qp`` and errors are as in `solve`.
         """
-        plain = qp is None and warm_start is None and s.dtype in (torch.float32, torch.float64)
-        if plain and s.numel() == self.n_p and is_eager((s,)) and not is_differentiating():
-            u = self._action_at_rest(self._checked(s).cpu().numpy(), warm=False)
+        s = self._checked(s)
+        alone = qp is None and warm_start is None and s.is_cpu and s.numel() == self.n_p
+        plain = alone and s.dtype in (torch.float32, torch.float64) and is_eager((s,))
+        if plain and not is_differentiating():
+            u = self._action_at_rest(s.numpy(), warm=False)
             if u is not None:
-                return torch.from_numpy(u).to(s.device)
-        return self._action(self.solve(s, warm_start=warm_start, qp=qp), s.dtype)
+                return torch.from_numpy(u)
+        return self._action(self._solve(s, qp, warm_start), s.dtype)
 
     @without_gradients
     def predict(self, observation: Any) -> np.ndarray:

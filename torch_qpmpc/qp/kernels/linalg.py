@@ -46,8 +46,8 @@ class Progress(Listener):
     def on_start(self, event: Event) -> None:
         from tqdm import tqdm  # most processes load what is compiled
 
-        data, text = event.data or {}, "compiling for this processor, once"
-        kernel = data["dispatcher"].py_func
+        assert event.data is not None
+        kernel, text = event.data["dispatcher"].py_func, "compiling for this processor, once"
         own = kernel.__module__.startswith("torch_qpmpc") and not self._bars
         hidden = None if own else True  # None: without a terminal
         self._bars.append(tqdm(desc=text, unit=" kernels", leave=False, disable=hidden))
