@@ -1,9 +1,10 @@
-"""The torch backend on a GPU beside DAQP on the CPU and qpax on the same GPU.
+"""The torch backend on a GPU beside DAQP on the CPU, and qpax and Moreau on the same GPU.
 
     python -m tests.benchmarks.gpu --write
 
 Medians of wall-clock time, with the device synchronised. The QPs are the point mass's with a dense
-C and N = 10; all of theta is learned. qpax (with JAX for the GPU) is skipped if not installed.
+C and N = 10; all of theta is learned. qpax (with JAX for the GPU) and Moreau are skipped if not
+installed.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from torch import Tensor
 
 import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
+from tests.benchmarks.peers import moreau
 from tests.benchmarks.problems import PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
 from tests.benchmarks.table import significant
@@ -34,8 +36,8 @@ from torch_qpmpc.study.markdown import replaced, table
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 GPU = torch.device("cuda")
 BATCHES = (1, 4_096, 65_536, 262_144)
-#: The batch of the comparison, and of the rows of qpax, which needs more memory.
-LARGE, OF_QPAX = 65_536, 16_384
+#: The batch of the comparison, and of the peers' rows: qpax needs more memory.
+LARGE, OF_PEERS = 65_536, 16_384
 ROUNDS = 7
 
 
@@ -92,7 +94,7 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
     return table([*head, "MiB; error"], lines)
 
 
-# Beside DAQP and qpax
+# Beside DAQP, qpax and Moreau
 
 
 def solved_by_daqp(count: int, first: int, warm: bool) -> float:
@@ -135,7 +137,7 @@ def on_cores(cores: int, count: int = LARGE) -> list[float]:
     return results
 
 
-def by_qpax(count: int = OF_QPAX) -> tuple[float, float] | None:
+def by_qpax(count: int = OF_PEERS) -> tuple[float, float] | None:
     """Return qpax's seconds, and its largest relative error of a value; None without it."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if find_spec("jax") is None or find_spec("qpax") is None:
@@ -159,6 +161,19 @@ def by_qpax(count: int = OF_QPAX) -> tuple[float, float] | None:
     return seconds(lambda: solve(*data).block_until_ready()), float(error)
 
 
+def by_moreau(count: int = OF_PEERS) -> tuple[float, float] | None:
+    """Return the seconds of Moreau's interior point, and its largest relative error of a value."""
+    if find_spec("moreau") is None:
+        return None
+    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, count).s
+    values = moreau(GPU.type, "ipm")
+    with torch.no_grad():
+        expected = mpc.value(s)
+        qp, on_gpu = mpc.to(GPU).quadratic_program(), s.to(GPU)
+        error = relative_error(values(qp, on_gpu).cpu(), expected).max()
+        return seconds(lambda: values(qp, on_gpu)), float(error)
+
+
 def comparison(device: torch.device, count: int = LARGE) -> str:
     """Return the table of all solvers at one batch, in microseconds a QP."""
     mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
@@ -171,8 +186,10 @@ def comparison(device: torch.device, count: int = LARGE) -> str:
     cores = os.cpu_count() or 1
     rows.append(("daqp, on one core", count, on_cores(1, count)))
     rows.append((f"daqp, on {cores} cores", count, on_cores(cores, count)))
-    if (peer := by_qpax(min(count, OF_QPAX))) is not None:
-        rows.append((f"qpax, on the GPU (error {peer[1]:.0e})", min(count, OF_QPAX), [peer[0]]))
+    for name, of in {"qpax": by_qpax, "Moreau": by_moreau}.items():
+        if (peer := of(min(count, OF_PEERS))) is not None:
+            label = f"{name}, on the GPU (error {peer[1]:.0e})"
+            rows.append((label, min(count, OF_PEERS), [peer[0]]))
     lines = [
         [name, f"{batch:,}", *(significant(1e6 * x / batch) for x in each), *[""] * (2 - len(each))]
         for name, batch, each in rows

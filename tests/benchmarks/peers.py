@@ -116,7 +116,7 @@ def clarabel() -> Values:
     return values
 
 
-def moreau() -> Values:
+def moreau(device: str = "cpu", solver: str = "active_set") -> Values:
     """Make Moreau's torch layer, at its default tolerances, for each size of a batch."""
     package, Solver = needs("moreau"), needs("moreau.torch").Solver
     layers: dict[torch.Size, Any] = {}
@@ -127,12 +127,12 @@ def moreau() -> Values:
         matrices = full.Q, torch.cat((full.A, G))
         if fixed.shape not in layers:
             # Entries that are zero today, of G and of the diagonal of H, are learned, too.
-            masks = [(full.Q != 0) | torch.eye(len(full.Q), dtype=torch.bool)]
+            masks = [(full.Q != 0) | torch.eye(len(full.Q)).to(full.Q).bool()]
             masks.append(torch.ones_like(matrices[1], dtype=torch.bool))
-            patterns = [sp.csr_matrix(mask.numpy()) for mask in masks]
+            patterns = [sp.csr_matrix(mask.cpu().numpy()) for mask in masks]
             places = [torch.from_numpy(x) for P in patterns for x in (P.indptr, P.indices)]
             cones = package.Cones(num_zero_cones=len(full.A), num_nonneg_cones=len(G))
-            settings = package.Settings(device="cpu", solver="active_set", batch_size=len(fixed))
+            settings = package.Settings(device=device, solver=solver, batch_size=len(fixed))
             layers[fixed.shape] = masks, Solver(*reversed(masks[1].shape), *places, cones, settings)
         masks, layer = layers[fixed.shape]
         P, A = (x[mask] for x, mask in zip(matrices, masks, strict=True))
