@@ -13,7 +13,7 @@ from tests.benchmarks.interleaved import Interleaved
 #: Packages that are timed, or that times depend on.
 PACKAGES = (
     *("torch", "numpy", "proxsuite", "daqp"),
-    *("qpth", "cvxpylayers", "diffcp", "clarabel", "qpsolvers", "piqp"),
+    *("qpth", "cvxpylayers", "diffcp", "clarabel", "qpsolvers", "piqp", "moreau"),
 )
 
 
