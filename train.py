@@ -30,32 +30,31 @@ from torchrl import torchrl_logger
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.algorithms import make_learner, make_operator
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, drop_previous, save_checkpoint
-from torch_qpmpc.experiment.collection import (
+from torch_qpmpc.experiment.algorithms import (
     batches,
     make_collector,
+    make_learner,
+    make_operator,
     make_run_replay,
     warm_up_batches,
 )
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, save_checkpoint
 from torch_qpmpc.experiment.config import check_config
-from torch_qpmpc.experiment.costs import cost_text
-from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards
+from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched, settled
 from torch_qpmpc.experiment.metrics import (
+    Tally,
     draw_outcome,
     report,
     run_summary,
     table,
     update_metrics,
 )
-from torch_qpmpc.experiment.outcome import check_provable, export_run, prove_run
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.run_folder import RunFolder
+from torch_qpmpc.experiment.run_folder import RunFolder, export_run
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
-from torch_qpmpc.experiment.tally import Tally
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import COMMAND, named_task, resume_arguments
 
@@ -88,8 +87,6 @@ def _train(
 
     # The QP, and J of all that it is compared with.
     physics = make_physics(cfg)
-    if cfg.prove is not None:
-        check_provable(physics)
     identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
     physics = physics if identified is None else identified.plant(physics)
     start = make_mpc(cfg, physics, identified)
@@ -99,13 +96,10 @@ def _train(
 
     # The learner: Q-learning of first or second order.
     operator = make_operator(mpc)
-    released = state is not None and state["arguments"]["structure"] != mpc.structure
-    if released:
-        mpc.release()
     plant = None
     if identified is not None and cfg.optimizer.name == "closed_loop":
         plant = identified.simulated(cfg, physics, start.scheme)
-    learner = make_learner(cfg, operator, cfg.release if released else 0, plant)
+    learner = make_learner(cfg, operator, plant)
     replay = make_run_replay(cfg, mpc)
     gate = RunGate(cfg, learner, physics)
     if state is None and mpc is not start:
@@ -170,10 +164,6 @@ def _train(
 
             if update % cfg.log_interval == 0:
                 run.log(update_metrics(terms, losses, tally, times, mpc, learner), update)
-            if update == cfg.release:
-                mpc.release()
-                learner = make_learner(cfg, operator, update, plant)
-                gate.release(learner)
             run.log(gate.judge(update), update)
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
@@ -201,10 +191,7 @@ def _train(
         summary |= {} if identified is None else identified.summary
         if cfg.export is not None:
             export_run(gate.mpc, run.path, quiet)
-        if cfg.prove is not None:
-            summary |= prove_run(gate.mpc, physics, cfg.prove, quiet)
         run.finish(summary)
-        drop_previous(run.path / CHECKPOINT)
     if not quiet:
         print(f"\n{table(summary)}\n\n{run.path}")
         check_rewards(evaluation.loops["learned"], physics)

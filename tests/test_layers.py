@@ -41,7 +41,6 @@ LAYERS = {
         "learning",
         "envs",
         "analysis",
-        "proofs",
     },
     "study": {
         "errors",
@@ -66,16 +65,16 @@ LAYERS = {
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 435,
-    "analysis": 1063,
+    "analysis": 1039,
     "control": 4312,
-    "envs": 1502,
-    "experiment": 3613,
+    "envs": 1477,
+    "experiment": 3435,
     "export": 1441,
-    "learning": 2831,
-    "mpc": 5361,
+    "learning": 2776,
+    "mpc": 5253,
     "proofs": 1003,
     "qp": 5934,
-    "study": 611,
+    "study": 608,
 }
 #: Libraries that only some layers may import.
 RESERVED = {

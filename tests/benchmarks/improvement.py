@@ -24,7 +24,7 @@ import train
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.costs import cost_text
+from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log

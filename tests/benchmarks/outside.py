@@ -41,7 +41,7 @@ from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.costs import cost_text
+from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torch_qpmpc.experiment.blow_ups import without_blow_ups
+from torch_qpmpc.experiment.logs import without_blow_ups
 
 
 def log() -> TensorDict:

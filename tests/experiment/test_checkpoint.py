@@ -1,4 +1,4 @@
-"""Checkpoints are written atomically and keep the previous one; damage is found."""
+"""Checkpoints are written atomically; damage is found."""
 
 from __future__ import annotations
 
@@ -10,17 +10,12 @@ import pytest
 import torch
 
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.checkpoint import (
-    PREVIOUS,
-    drop_previous,
-    load_checkpoint,
-    save_checkpoint,
-)
+from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Write two checkpoints, of which the first is kept as the previous one."""
+    """Write two checkpoints, one after the other."""
     path = tmp_path / "checkpoint.pt"
     for update in (1, 2):
         save_checkpoint(path, {"update": update, "C": torch.arange(99.0)})
@@ -31,20 +26,9 @@ def names(path: Path) -> set[str]:
     return {found.name for found in path.parent.iterdir()}
 
 
-def test_the_checkpoint_before_is_kept_and_dropped_at_the_end(path):
+def test_a_full_disk_leaves_the_checkpoint_as_it_is(path, monkeypatch):
     assert load_checkpoint(path)["update"] == 2
     assert torch.equal(load_checkpoint(path)["C"], torch.arange(99.0))
-    assert load_checkpoint(path.with_name(PREVIOUS))["update"] == 1
-    assert names(path) == {"checkpoint.pt", PREVIOUS}
-    drop_previous(path)
-    assert names(path) == {"checkpoint.pt"}
-
-
-@pytest.mark.parametrize("damaged", [False, True])
-def test_a_full_disk_changes_neither(path, monkeypatch, damaged):
-    """A damaged checkpoint does not replace the previous one, either."""
-    if damaged:
-        path.write_bytes(b"damaged")
     before = path.read_bytes()
 
     def full(*_: object) -> None:
@@ -55,8 +39,7 @@ def test_a_full_disk_changes_neither(path, monkeypatch, damaged):
         with pytest.raises(OSError, match="No space left"):
             save_checkpoint(path, {"update": 3})
     assert path.read_bytes() == before
-    assert load_checkpoint(path.with_name(PREVIOUS))["update"] == 1
-    assert names(path) == {"checkpoint.pt", PREVIOUS}
+    assert names(path) == {"checkpoint.pt"}
     save_checkpoint(path, {"update": 3})  # the crash's leftovers do not interfere
     assert load_checkpoint(path)["update"] == 3
 
@@ -76,14 +59,14 @@ def test_a_flipped_bit_is_found_or_changes_nothing(path):
         else:
             assert torch.equal(found["C"], torch.arange(99.0)), position
     assert len(refused) > len(positions) / 4
-    assert all("use the previous one" in sentence for sentence in refused)
+    assert all("use another one" in sentence for sentence in refused)
 
 
 def test_a_truncated_a_missing_and_another_file_are_named(path):
     data = path.read_bytes()
     for content in (data[: len(data) // 2], data[:-5], b"", b"not a checkpoint"):
         path.write_bytes(content)
-        with pytest.raises(QPError, match=r"checkpoint: got .*, which cannot be read .* previous"):
+        with pytest.raises(QPError, match=r"checkpoint: .* cannot be read .*another one"):
             load_checkpoint(path)
     path.unlink()
     with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which does not exist"):

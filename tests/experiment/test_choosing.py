@@ -34,10 +34,10 @@ from torch_qpmpc.experiment.choosing import (
     choose,
     chosen_before,
 )
+from torch_qpmpc.experiment.logs import estimated
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.identified import estimated
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.log import valid_steps
@@ -204,7 +204,7 @@ def test_zero_action_is_held_if_nothing_costs_less():
 
 
 def test_the_gate_keeps_the_held_action_and_the_run_resumes(tmp_path, monkeypatch):
-    settings = ("gate=true", "constraint=mpc", "optimizer=gauss_newton", "release=2", BOUNDED)
+    settings = ("gate=true", "constraint=mpc", "optimizer=gauss_newton", BOUNDED)
     cfg, whole, cut = make_config(*HOPELESS, *settings), tmp_path / "whole", tmp_path / "cut"
     summary = train.train(cfg, str(whole), quiet=True)
     assert summary["start"] == ZERO_ACTION
@@ -279,7 +279,7 @@ def turning(monkeypatch):
 
 @pytest.mark.usefixtures("turning")
 def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path):
-    settings = ("gate=act", "optimizer=gauss_newton", "constraint=mpc", "release=2")
+    settings = ("gate=act", "optimizer=gauss_newton", "constraint=mpc")
     run = trained_and_resumed(make_config(*DATA, *settings), tmp_path)
     assert run.summary["start"].startswith(BLENDED)
     assert run.policy.schedule is not None

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, SolveLog
-from torch_qpmpc.experiment.collection import batches, make_collector
+from torch_qpmpc.experiment.algorithms import batches, make_collector
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 

@@ -184,7 +184,6 @@ def test_missing_keys(key):
         ("constraint.structure=tied", "constraint.structure: got 'tied', expected free. A tied C"),
         ("constraint=si constraint.structure=varying", "got 'varying', expected free. gauss_new"),
         ("constraint=mpc constraint.learn=[C,G]", r"got \['C', 'G'\], expected no G. No task has"),
-        ("release=10", "release: got 10, expected null. Nothing is tied: choose constraint=mpc"),
         ("task.terminal_weight=riccati", "got 'riccati', expected default or identity. The Ricc"),
         (
             "optimizer=closed_loop",

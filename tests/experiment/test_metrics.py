@@ -11,8 +11,7 @@ import torch
 from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.experiment.costs import closed_gap
-from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.evaluation import Evaluation, closed_gap
 from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder

@@ -31,9 +31,9 @@ DATA = ("start=data", "start.transitions=200", "constraint=free")
 @pytest.mark.parametrize(
     "overrides",
     [
-        ("optimizer=adam", "constraint=mpc", "release=7", "solver=torch", "step=projection"),
+        ("optimizer=adam", "constraint=mpc", "solver=torch", "step=projection"),
         (SECOND, "constraint=free", "replay=false", "noise=brownian", "steps_per_update=3"),
-        (SECOND, "gate=plant", "constraint=mpc", "release=3", "solver=proxqp"),
+        (SECOND, "gate=plant", "constraint=mpc", "solver=proxqp"),
         (*LOOPS, "gate=true", *DATA),
         (SECOND, "task=store", "constraint=combined", "replay_capacity=40"),
     ],
@@ -98,7 +98,6 @@ def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, whole):
     state = load_checkpoint(tmp_path / "checkpoint.pt")
     assert (state["replay"], state["collector"], state["update"]) == (None, None, 8)
     go_on(tmp_path)
-    assert not (tmp_path / "checkpoint-previous.pt").exists()
     assert_same_numbers(tmp_path, whole)
 
 
@@ -125,19 +124,20 @@ def test_only_a_stopped_run_resumes(tmp_path, stopped):
         resumed(stopped, [])
 
 
-def test_a_damaged_checkpoint_names_the_previous_one_which_resumes(stopped, whole):
-    (stopped / "checkpoint.pt").write_bytes(b"PK" + bytes(1000))
-    before = stopped / "checkpoint-previous.pt"
-    with pytest.raises(QPError, match=rf"cannot be read .*use the previous one, {before}\.$"):
-        resumed(stopped, [])
-    cfg, state = resumed(before, [])
+def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
+    state = load_checkpoint(stopped / "checkpoint.pt")
+    state["config"] |= {"release": None}
+    save_checkpoint(stopped / "checkpoint.pt", state)
+    with (stopped / "config.yaml").open("a") as file:
+        file.write("release: null\n")
+    cfg, state = resumed(stopped, [])
     train.train(cfg, str(stopped), state)
     assert_same_numbers(stopped, whole)
 
 
 def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
-    state = load_checkpoint(stopped / "checkpoint.pt")
-    del state["config"]
+    whole = load_checkpoint(stopped / "checkpoint.pt")
+    state = {name: part for name, part in whole.items() if name != "config"}
     save_checkpoint(stopped / "checkpoint.pt", state)
     with pytest.raises(QPError, match=r"checkpoint: got a dict, .*Another version"):
         resumed(stopped, [])
@@ -145,12 +145,13 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):
         resumed(stopped, [])
     cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2")
+    save_checkpoint(stopped / "checkpoint.pt", whole)
     OmegaConf.save(cfg, stopped / "config.yaml", resolve=True)
     message = (
         r"checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's seed=2"
     )
     with pytest.raises(QPError, match=message):
-        resumed(stopped / "checkpoint-previous.pt", [])
+        resumed(stopped, [])
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.launch import locked
-from torch_qpmpc.experiment.sweeps import (
+from torch_qpmpc.experiment.launch import (
     finished_run,
+    locked,
     sub_folder,
 )
 

@@ -11,8 +11,8 @@ from numba.core import event
 from tensordict import TensorDict
 
 from tests.problems import random_mpc, random_states
-from torch_qpmpc.experiment import tally as module
-from torch_qpmpc.experiment.tally import Tally
+from torch_qpmpc.experiment import metrics as module
+from torch_qpmpc.experiment.metrics import Tally
 
 
 def batch(reward: float) -> TensorDict:

@@ -142,17 +142,6 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     assert 0 < violation[24] == pytest.approx(summary["train_violation"])
 
 
-@pytest.mark.parametrize(
-    ("optimizer", "structure"), [("adam", "varying"), ("gauss_newton", "tied")]
-)
-def test_a_released_scheme_learns_what_an_MPC_scheme_cannot(tmp_path, optimizer, structure):
-    options = ("constraint=mpc", f"constraint.structure={structure}", "release=2")
-    run_small(tmp_path, *options, f"optimizer={optimizer}")
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["arguments"]["structure"] == "free"
-    deviation, distance = learned_C(tmp_path)
-    assert np.abs(deviation[distance > 0]).max() > 0
-
-
 def test_a_seed_determines_every_number(tmp_path):
     for name, seed in (("first", 3), ("again", 3), ("other", 4)):
         torch.manual_seed(len(name))  # earlier use of the generator has no effect

@@ -241,35 +241,6 @@ def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
     assert not optimizer.state
 
 
-@pytest.mark.parametrize("trust_region", [False, True])
-def test_residuals_are_rows_of_the_least_squares_problem(trust_region):
-    """1/2 v |r + dr/dq dq|^2 joins the batch, with v the mean squared TD error."""
-    mpc = QPMPC.from_model(
-        torch.eye(2), torch.ones(2, 1), 3, structure="tied", learn=("q",), stage_weight=[1.0] * 3
-    )
-    options = {"damping": DAMPING, "trust_region": trust_region}
-    optimizer = GaussNewton(mpc, residuals=lambda qp: 0.3 * (qp.q - 1), **options)
-    s, a = pairs()
-    delta = torch.linspace(-0.2, 0.3, len(s)).double()
-    reference = Reference(mpc, optimizer)
-    (rows,), (leaf,) = reference.gradients(s, a), reference.leaves
-    before, r = leaf.detach().clone(), 0.3 * (mpc.quadratic_program().q - 1)
-    J = [torch.autograd.grad(x, leaf, retain_graph=True)[0].flatten() for x in r]
-    metric = reference.metric([rows], mpc.solve(s, a).z.detach())
-    weight = delta.square().mean().sqrt()
-    rows = torch.cat((rows, weight * torch.stack(J)))
-    errors = torch.cat((delta, -weight * r.detach()))
-    mu = DAMPING * (metric * rows[: len(s)].square()).sum(-1).mean()
-    expected = torch.linalg.solve(rows.mT @ rows + torch.diag(mu / metric), rows.mT @ errors)
-    assert optimizer.step(s, a, mpc.action_value(s, a).detach() + delta).accepted
-    assert_close((leaf.detach() - before).flatten(), expected, rtol=1e-5, atol=1e-9)
-
-
-def test_residuals_need_a_tied_C():
-    with pytest.raises(QPError, match="residuals: got them with a free C, expected a tied C"):
-        GaussNewton(random_mpc(2), residuals=lambda qp: qp.q)
-
-
 def test_the_trust_region_counts_weighted_errors():
     """The predicted decrease is that of the weighted objective: a small step meets it."""
     mpc = random_mpc(2)

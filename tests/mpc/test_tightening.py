@@ -6,8 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
-from torch_qpmpc.mpc.tightening import back_off, prediction_covariance, tighten
+from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 N = 4
 A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
@@ -92,32 +91,6 @@ def test_bounds_that_would_cross_meet_halfway_and_infinite_ones_stay():
     assert x[..., 1].isinf().all()
 
 
-def tied(**options) -> QPMPC:
-    return scheme(structure="tied", **{"stage_weight": [1.0, 1.0, 0.1], "learn": ["C"], **options})
-
-
-def test_a_back_off_is_the_tightening_by_the_current_model():
-    mpc, reference = tied(), scheme()
-    with torch.no_grad():
-        mpc.leaves("C")[0].mul_(0.9)  # a model that has learned
-    back_off(mpc, W)
-    model = mpc.model()[0].detach()
-    K = -lqr_gain(model, B, stage_weight(mpc))
-    tighten(reference, prediction_covariance(model + B @ K, W, N), K=K)
-    assert_close(mpc.lb, reference.lb)
-    assert_close(mpc.ub, reference.ub)
-
-
-def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
-    unstable = torch.tensor([[1.1, 0.0], [0.0, 0.9]]).double()  # and B does not reach it
-    mpc, reference = tied(), scheme()
-    with torch.no_grad():
-        mpc.leaves("C")[0].copy_(unstable)
-    back_off(mpc, W, 0.9)
-    tighten(reference, prediction_covariance(unstable, W, N), 0.9)
-    assert_close(mpc.ub, reference.ub)
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -129,9 +102,6 @@ def test_a_back_off_without_a_regulator_is_that_of_the_open_loop():
             lambda: tighten(scheme(learn=("C", "ub")), SIGMA),
             "mpc: got one that learns ub, expected",
         ),
-        (lambda: back_off(None, W), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
-        (lambda: back_off(scheme(), W), "structure: got 'free'"),
-        (lambda: back_off(tied(), B), "W: got shape .* expected shape"),
     ],
 )
 def test_a_mistake_is_named(call, message):

@@ -90,16 +90,16 @@ def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
 
 @pytest.fixture(scope="module")
 def gated(tmp_path_factory):
-    """Train a run whose learned policy is in best.pt, and a scheme that is released."""
+    """Train a run whose learned policy is in best.pt."""
     folder = tmp_path_factory.mktemp("gated")
-    more = ("gate=true", "logger=csv", "constraint=mpc", "release=2")
+    more = ("gate=true", "logger=csv", "constraint=mpc")
     train.train(make_config(*SMALL, *more), str(folder), quiet=True)
     return folder
 
 
 def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
     run = qm.load_run(gated)
-    assert run.policy.structure == "free"
+    assert run.policy.structure == run.start.structure == "tied"
     s = torch.ones(3, run.policy.n_p)
     assert torch.equal(run.policy.policy(s), qm.QPMPC.load(gated / "best.pt").policy(s))
     assert run.summary["J_best"] == run.metrics["eval/J"].iloc[-1]

@@ -107,11 +107,7 @@ def _draw_prediction_form(axes: Axes, form: PredictionForm, title: str) -> None:
 
 
 def canonical_figure(mpc: QPMPC) -> Figure:
-    """Plot C beside its canonical form, and the predictions at the start beside the learned ones.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
+    """Plot C beside its canonical form, and the first predictions beside the learned ones."""
     start = prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, n_d=mpc.n_d)
     learned = predictions(mpc)
     figure = Figure(figsize=(14, 9), layout="constrained")
@@ -211,9 +207,6 @@ def episode_figure(
         plans: see `plans_along`; drawn beside what was realised.
         outputs, actions: names of the entries of y and u, in their panels.
         xlabel: the label of the time axis.
-
-    Raises:
-        QPError: if a shape or a number of names does not fit.
 
     Example:
         >>> import torch

@@ -166,9 +166,6 @@ def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) ->
     Returns:
         ``causality_defect``, ``toeplitz_defect``, ``distance_to_mpc`` and, with a true model,
         ``model_error``; all nan if C has no prediction form, so that training continues.
-
-    Raises:
-        QPError: if an argument does not fit.
     """
     check_kind("mpc", mpc, QPMPC)
     true = None if true_model is None else _checked_model(mpc, true_model)

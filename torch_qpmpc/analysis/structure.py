@@ -130,21 +130,13 @@ def prediction_form(
 
 
 def predictions(mpc: QPMPC) -> PredictionForm:
-    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
+    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi."""
     with torch.no_grad():
         return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.n_d)
 
 
 def canonical(mpc: QPMPC) -> Tensor:
-    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded.
-
-    Raises:
-        QPError: if C has no prediction form.
-    """
+    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded."""
     form = predictions(mpc)
     return canonical_matrix(form, stage_models(form).A)[0]
 
@@ -156,9 +148,6 @@ def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     MPC scheme only the band remains, C_0. In general, a row's other entries are what x_k, u_k and
     d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is C
     ``(N n_x, n_z)`` and b ``(N n_x,)``.
-
-    Raises:
-        QPError: if ``form`` has batch dimensions, or the shape of A does not fit.
     """
     _check_form(form)
     n_x, N = form.layout.n_x, form.layout.horizon
@@ -364,9 +353,6 @@ def one_step_error(
 
     Returns:
         ``(*batch,)``.
-
-    Raises:
-        QPError: if ``model`` is not a `NearestModel`, or a shape does not fit.
     """
     check_kind("model", model, NearestModel, "Pass nearest_model(form), or stage_models(form).")
     own = (model.A, model.B, model.E, model.offset.unsqueeze(-1))

@@ -135,9 +135,6 @@ def plant_loop(
             signals w, for rivals that see them and filters that need a reset.
         plant: the plant.
         steps, starts, seed, gamma: as in `closed_loop`.
-
-    Raises:
-        QPError: as in `closed_loop`.
     """
     _check(policy, steps, starts, seed, gamma)
     check_kind("plant", plant, Plant, "Use closed_loop for a LinearSystem.")
@@ -180,9 +177,6 @@ def gymnasium_loop(
 
     After an episode's end its state stays constant, at no cost. ``steps`` is by default the length
     of the environment's own episodes. The policy is not called once all episodes have ended.
-
-    Raises:
-        QPError: as in `closed_loop`.
     """
     check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
     steps = plant.max_steps if steps is None else steps

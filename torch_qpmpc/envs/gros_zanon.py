@@ -70,11 +70,6 @@ class GrosZanonLTI(LinearSystem):
         """Return ``count`` copies of s_0, ``(count, 2)``, without drawing from ``rng``."""
         return self.A.new_tensor([[0, 0.15]]).repeat(count, 1)
 
-    def start_box(self) -> tuple[Tensor, Tensor]:
-        """Return the box of starts, which is the point s_0."""
-        s = self.starts(torch.Generator(), 1)[0]
-        return s, s
-
     def draw(self, rng: Rng, count: int) -> Tensor:
         """Draw numbers uniform in [0, 1) from ``rng``, ``(count, 1)``, one per episode."""
         return uniform(rng, count, 1)

@@ -139,10 +139,6 @@ class LinearSystem(ABC):
     def starts(self, rng: Rng, count: int) -> Tensor:
         """Draw start states ``(count, n_x)`` from the generator ``rng``."""
 
-    def start_box(self) -> tuple[Tensor, Tensor] | None:
-        """Return the smallest box ``(n_x,)`` of all starts; None, unless overridden, if unknown."""
-        return None
-
     @abstractmethod
     def draw(self, rng: Rng, count: int) -> Tensor:
         """Draw numbers ``(count, n_noise)`` from ``rng``, for one step of ``count`` episodes."""

@@ -114,10 +114,6 @@ class PointMass(LinearSystem):
         draws = [rng.uniform(-r, r, size=(count, 2)) for r in ranges]
         return torch.as_tensor(np.hstack(draws)).to(self.A)
 
-    def start_box(self) -> tuple[Tensor, Tensor]:
-        """Return the box of all starts."""
-        return -self.start_range, self.start_range
-
     def draw(self, rng: Rng, count: int) -> Tensor:
         """Draw standard normal numbers ``(count, 4)`` from ``rng``."""
         return normal(rng, count, 4)
@@ -133,9 +129,6 @@ class PointMass(LinearSystem):
         Returns:
             A_hat ``(4, 4)`` and B_hat ``(4, 2)``, the true ones plus entries uniform in
             [-0.05, 0.05], and theta_1..theta_4 ``(4,)`` uniform in [0.5, 5]; drawn in this order.
-
-        Raises:
-            QPError: if ``seed`` is not a whole number >= 0 and < 2^63.
         """
         check_seed(seed)
         rng = np.random.default_rng(seed)
@@ -158,9 +151,6 @@ class PointMassEnv(LinearSystemEnv):
     Args:
         physics: the system; None for ``PointMass()``.
         num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
-
-    Raises:
-        QPError: if an argument does not fit.
 
     Example:
         >>> PointMassEnv(num_envs=2, seed=0).rollout(3)["observation"].shape

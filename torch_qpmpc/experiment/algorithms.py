@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
+from torchrl.collectors import Collector
+from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.experiment.blow_ups import without_blow_ups
+from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.learning.closed_loop import Descent, SimulatedPlant
 from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -36,7 +38,7 @@ from torch_qpmpc.mpc.module import QPMPC
 
 @dataclass(frozen=True)
 class Learner:
-    """The objects that update theta; `QPMPC.release` requires a new one.
+    """The objects that update theta.
 
     Attributes:
         learn: updates theta from a batch.
@@ -77,13 +79,9 @@ def make_operator(mpc: QPMPC) -> QPActorValueOperator:
 def make_learner(
     cfg: DictConfig,
     operator: QPActorValueOperator,
-    done: int = 0,
     plant: SimulatedPlant | None = None,
 ) -> Learner:
-    """Make the learner; its rates continue after ``done`` updates.
-
-    ``plant`` is the identified one, which ``optimizer=closed_loop`` needs.
-    """
+    """Make the learner; ``plant`` is the identified one, for ``optimizer=closed_loop``."""
     mpc = operator.module
     loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip, weighted=cfg.weighted)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
@@ -92,11 +90,11 @@ def make_learner(
         options = cfg.optimizer
         descent = Descent(mpc, plant, options.loops, options.steps, options.lr)
         optimizer = descent.optimizer
-        scheduler = make_scheduler(cfg, optimizer, done)
+        scheduler = make_scheduler(cfg, optimizer)
         update = closed_loop_update(mpc, descent, scheduler, cfg.seed, *penalties)
     else:
         optimizer = make_optimizer(cfg, mpc)
-        scheduler = make_scheduler(cfg, optimizer, done)
+        scheduler = make_scheduler(cfg, optimizer)
         if isinstance(optimizer, GaussNewton):
             update = second_order(mpc, loss_module, optimizer, *penalties)
         else:
@@ -171,11 +169,11 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
     return torch.optim.SGD(groups)
 
 
-def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer, done: int = 0) -> LambdaLR:
-    """Make the linear decay of the learning rates, continued after ``done`` updates."""
+def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer) -> LambdaLR:
+    """Make the linear decay of the learning rates."""
     # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates
-    return LambdaLR(optimizer, lambda k: 1 - (1 - last) * min((done + k) / updates, 1))
+    return LambdaLR(optimizer, lambda k: 1 - (1 - last) * min(k / updates, 1))
 
 
 def evaluate(
@@ -190,3 +188,44 @@ def evaluate(
     return find_task(cfg.task).closed_loop(
         policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
     )
+
+
+def make_collector(cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBase) -> Collector:
+    """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration."""
+    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
+    exploration = AdditiveGaussianModule(
+        env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
+    )
+    policy = TensorDictSequential([actor, exploration])
+    options: Any = {"auto_register_policy_transforms": False}
+    frames = cfg.num_envs * cfg.steps_per_update
+    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **options)
+
+
+def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
+    """Make a run's replay of transitions and, for the SI penalty, of windows."""
+    si = cfg.constraint.si
+    return Replay(
+        cfg.replay_capacity,
+        cfg.num_envs,
+        cfg.batch_size,
+        cfg.task.horizon,
+        1 if si is None else si.windows,
+        seed=cfg.seed,
+        active_rows=len(mpc.G),
+        preview_key=preview_key(mpc),
+    )
+
+
+def warm_up_batches(cfg: DictConfig) -> int:
+    """Return the number of batches, of ``steps_per_update`` steps each, of a run's warm-up."""
+    return -(-cfg.warmup_steps // cfg.steps_per_update)
+
+
+def batches(collector: Collector) -> Iterator[TensorDictBase]:
+    """Yield batches of ``(num_envs, steps_per_update)`` transitions under the newest theta.
+
+    The policy's active sets are left out: only its next step uses them.
+    """
+    for batch in collector:
+        yield batch.exclude(POLICY_ACTIVE_SET)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -11,19 +12,19 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 from scipy.special import stdtrit
-from tensordict import TensorDictBase, pad
+from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.costs import cost_text
+from torch_qpmpc.experiment.evaluation import cost_text
+from torch_qpmpc.experiment.logs import below
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, write_whole
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.blended import identify_blended
-from torch_qpmpc.mpc.log import valid_steps
 
 #: Episodes of each start in the first round.
 FEW = 4
@@ -50,10 +51,9 @@ NOTHING = (
 
 
 class Choice(NamedTuple):
-    """The starts by name, best first; one of them is ``chosen``.
+    """The starts by name, best first, one of them ``chosen``: J, its standard ``error``, the count.
 
-    ``J`` is the mean cost of ``episodes`` with its standard ``error``, and ``transitions`` at most
-    the number of their steps. ``print`` shows the table.
+    The ``transitions`` are at most the steps of the ``episodes``.
     """
 
     table: pd.DataFrame
@@ -109,25 +109,20 @@ def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]
 
     They are MPC of the estimate and of the outputs, each with the regulator's cost of x_N, and, at
     twice the horizon, models of the outputs that are blended where the plant is nonlinear.
-
-    Raises:
-        QPError: as in `identified_start`.
     """
     estimate, N = identified_start(cfg, physics, log), cfg.task.horizon
     outputs = estimate if not estimate.order else identified_start(cfg, physics, log, order=0)
-    regulated = estimate.cost is not None and cfg.task.hessian != "diagonal"
     named = ({ESTIMATE: estimate} if estimate.order else {}) | {OUTPUTS: outputs}
-    named = {name: start._replace(riccati=regulated) for name, start in named.items()}
+    for name, start in named.items() if cfg.task.hessian != "diagonal" else ():
+        with contextlib.suppress(QPError):  # the model and the cost have no regulator
+            regulated = start._replace(riccati=start.cost is not None)
+            make_mpc(cfg, start.plant(physics), regulated)
+            named[name] = regulated
     if not outputs.layout.n_d and cfg.export is None and cfg.constraint.si is None:
         blended = identify_blended(outputs.log, 2 * N)
         unexplained = {count: 1 - R2 for count, R2 in blended.R2.items()}
         if min(unexplained.values()) < BLENDED_SHARE * unexplained[1]:
             named[BLENDED] = outputs._replace(horizon=2 * N, blended=blended)
-    for name, start in named.items():
-        try:
-            make_mpc(cfg, start.plant(physics), start)
-        except QPError:  # the model and the cost have no regulator
-            named[name] = start._replace(riccati=False)
     return named
 
 
@@ -148,30 +143,31 @@ def choose(
     costs: dict[str, Tensor] = {}
     few, steps = min(FEW, cfg.task.start_episodes), 0
 
+    def run(names: Iterable[str], count: int) -> None:
+        nonlocal steps
+        for name in names:
+            done = costs.get(name, torch.zeros(0, dtype=torch.float64))
+            if len(done) == count:
+                continue
+            plant = named[name].plant(physics)
+            if name == ZERO_ACTION:
+                policy = zero_action(plant)
+            else:
+                policy = warm_policy(make_mpc(cfg, plant, named[name]))
+            options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
+            options |= {"starts": count - len(done), "seed": APART + cfg.seed + len(done)}
+            loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
+            costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
+            steps = len(loop)
+            bar.update()
+
     def J(name: str) -> float:
         return costs[name].mean().item()
 
+    def error(x: Tensor) -> float:
+        return (x.std() / math.sqrt(len(x))).item()
+
     with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
-
-        def run(names: Iterable[str], count: int) -> None:
-            nonlocal steps
-            for name in names:
-                bar.set_postfix_str(name)
-                done = costs.get(name, torch.zeros(0, dtype=torch.float64))
-                if len(done) == count:
-                    continue
-                plant = named[name].plant(physics)
-                if name == ZERO_ACTION:
-                    policy = zero_action(plant)
-                else:
-                    policy = warm_policy(make_mpc(cfg, plant, named[name]))
-                options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
-                options |= {"starts": count - len(done), "seed": APART + cfg.seed + len(done)}
-                loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
-                costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
-                steps = len(loop)
-                bar.update()
-
         named = {f"{name}{FIRST}": start for name, start in candidates(cfg, physics, log).items()}
         run(named, few)
         log = below(log, explored(named[min(named, key=J)]))
@@ -183,9 +179,9 @@ def choose(
         run((*finalists, ZERO_ACTION), cfg.task.start_episodes)
     best = min(finalists, key=J)
     gain = costs[best] - costs[ZERO_ACTION]
-    bound = gain.mean() + float(stdtrit(len(gain) - 1, CONFIDENCE)) * _error(gain)
+    bound = gain.mean() + float(stdtrit(len(gain) - 1, CONFIDENCE)) * error(gain)
     chosen = best if gain.mean() == -math.inf or bound < 0 else ZERO_ACTION
-    rows = [(len(x), J(name), _error(x), steps * len(x)) for name, x in costs.items()]
+    rows = [(len(x), J(name), error(x), steps * len(x)) for name, x in costs.items()]
     table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions"])
     table["chosen"] = table.index == chosen
     choice = Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))
@@ -193,33 +189,10 @@ def choose(
 
 
 def chosen_before(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase, folder: Path) -> Start:
-    """Return the start that the run in ``folder`` has chosen from its logs.
-
-    Raises:
-        QPError: the table is missing or damaged, or the logs have no such start.
-    """
+    """Return the start that the run in ``folder`` has chosen from its logs."""
     choice = Choice.read(folder)
     first = choice.scheme.endswith(FIRST)
     named = candidates(cfg, physics, log[: -cfg.num_envs] if first else log)
     if (start := named.get(choice.scheme.removesuffix(FIRST))) is None:
         raise QPError.expected(STARTS, f"{choice.scheme!r}", f"one of {', '.join(named)}")
     return choice.of(start, physics)
-
-
-def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
-    """Return two logs, ``(T,)`` or ``(episodes, T)``, one below the other; padding is masked.
-
-    Entries that only one has, as in a log of one's own, are left out.
-    """
-    logs = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
-    steps = max(log.shape[1] for log in logs)
-    logs = [log.clone(recurse=False).set("mask", valid_steps(log)) for log in logs]
-    logs = [pad(log, [0, 0, 0, steps - log.shape[1]]) for log in logs]
-    common = set.intersection(*({*log.keys(True, True)} for log in logs))
-    both: Any = torch.cat([log.select(*common) for log in logs])
-    return both
-
-
-def _error(costs: Tensor) -> float:
-    """Return the standard error of the mean."""
-    return (costs.std() / math.sqrt(len(costs))).item()

@@ -20,9 +20,16 @@ from pydantic import (
 )
 
 from torch_qpmpc.errors import QPError, printable
-from torch_qpmpc.experiment.fields import Count, Fraction, Group, NonNegative, Positive, Whole
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.tasks import TASKS, TaskSettings, find_task
+from torch_qpmpc.experiment.tasks.registry import (
+    Count,
+    Fraction,
+    Group,
+    NonNegative,
+    Positive,
+    Whole,
+)
 from torch_qpmpc.files import damaged
 from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.qp.solvers import backend
@@ -135,7 +142,6 @@ class Config(Group):
     step: Annotated[
         Literal["cholesky", "projection", "sdp"], AfterValidator(lambda x: check_step(x) or x)
     ]
-    release: Count | None
     resume: str | None
     ablation: str | None
     gate: Literal["act", "plant"] | bool
@@ -145,7 +151,6 @@ class Config(Group):
         Literal["tensorboard", "csv", "wandb", "mlflow"], AfterValidator(_installed_logger)
     ]
     export: Literal["c"] | None
-    prove: NonNegative | None
     figures: bool
     rivals: bool | list[str]
     eval_interval: Count
@@ -170,8 +175,6 @@ class Config(Group):
             remedy = "Set the penalty to null, or learn C."
             self.conflict("constraint.learn", "a list with C, because a penalty on C is on", remedy)
         if part.structure == "free":
-            if self.release is not None:
-                self.conflict("release", "null", "Nothing is tied: choose constraint=mpc.")
             return self
         if part.deviation:
             remedy = "A tied C has nothing off its band to penalise."
@@ -279,12 +282,7 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def load_config(file: Path) -> DictConfig:
-    """Load a run's saved configuration as plain values.
-
-    Raises:
-        QPError: the file is missing or damaged, or has interpolations such as ``${oc.env:HOME}``,
-            which would read this computer's environment.
-    """
+    """Load a run's saved configuration as plain values."""
     try:
         cfg = OmegaConf.load(file)
         tree = OmegaConf.to_container(cfg, resolve=False)
@@ -297,6 +295,8 @@ def load_config(file: Path) -> DictConfig:
             raise ValueError("its task is not a mapping")
     except Exception as error:  # damaged files raise errors of any type
         raise damaged(file, error, "the configuration that a run wrote") from error
+    for key in [key for key in tree if key not in Config.model_fields and tree[key] is None]:
+        del cfg[key]  # of an earlier version, and off
     for key, value in flatten(tree).items():
         if isinstance(value, list | str) and "${" in str(value):
             remedy = "Interpolations of a saved configuration are not resolved: write the value."

@@ -92,14 +92,6 @@ class RunGate:
         """Keep the policy of a QP, until a candidate costs less."""
         self.mpc.load_state_dict(mpc.state_dict())
 
-    def release(self, learner: Learner) -> None:
-        """Free the C of the policy that is kept, as the new ``learner``'s is."""
-        self._learner = learner
-        if self._gate is None:
-            self.kept = learner.actor
-        else:
-            self.mpc.release()
-
     def summary(self) -> dict[str, int]:
         """Return the numbers of candidates accepted and rejected, and of transitions for them.
 

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix, episode_figure, plans_along
 from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.experiment.collection import warm_up_batches
-from torch_qpmpc.experiment.costs import cost_text
-from torch_qpmpc.experiment.evaluation import Evaluation
+from torch_qpmpc.experiment.algorithms import warm_up_batches
+from torch_qpmpc.experiment.evaluation import Evaluation, cost_text
 from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
 

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,12 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.checkpoint import CHECKPOINT
 from torch_qpmpc.experiment.config import settings
 from torch_qpmpc.experiment.tasks.code import COMMAND
+from torch_qpmpc.export.export import export_c
 from torch_qpmpc.files import damaged, write_whole
+from torch_qpmpc.mpc.module import QPMPC
 
+#: The folder of the C files in that of the run.
+C_FOLDER = "c"
 #: Entries of summary.json that are numbers or, if they are not finite, null.
 NUMBERS = ("seed", "closed_gap", "J_start", "J_best", "J_final", "J_true_model")
 NUMBERS += ("canonical_distance",)
@@ -93,6 +98,18 @@ class RunFolder:
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
+def export_run(mpc: QPMPC, folder: Path, quiet: bool) -> None:
+    """Write the policy as C into a run's folder; warn if that is not possible."""
+    try:
+        export = export_c(mpc, folder / C_FOLDER)
+    except QPError as error:
+        # The run's results are worth more than its export, which can be repeated.
+        warnings.warn(f"The policy is not exported. {error}", stacklevel=2)
+        return
+    if not quiet:
+        print(f"\n{export}")
+
+
 def make_logger(cfg: DictConfig, folder: Path) -> Logger:
     """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
     name = cfg.logger
@@ -107,11 +124,7 @@ def make_logger(cfg: DictConfig, folder: Path) -> Logger:
 
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:
-    """Read a run's metrics.csv by update, to the last digit.
-
-    Raises:
-        QPError: the file is missing or damaged.
-    """
+    """Read a run's metrics.csv by update, to the last digit."""
     file = Path(folder) / "metrics.csv"
     try:
         text = file.read_text(encoding="utf-8")

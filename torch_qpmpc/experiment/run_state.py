@@ -21,10 +21,10 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, PREVIOUS, load_checkpoint
+from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.tally import Tally
+from torch_qpmpc.experiment.metrics import Tally
 from torch_qpmpc.experiment.tasks.code import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import labelled
 from torch_qpmpc.learning.replay import Replay
@@ -74,11 +74,7 @@ def restore(
     collector: Collector,
     replay: Replay,
 ) -> Tally:
-    """Load a `snapshot` into the parts of a new run with the same configuration.
-
-    Raises:
-        QPError: a part does not match the snapshot.
-    """
+    """Load a `snapshot` into the parts of a new run with the same configuration."""
     tally, schedule = Tally(), vars(learner.scheduler)
     load: dict[str, Callable[[Any], object]] = {
         "loss_module": learner.loss_module.load_state_dict,
@@ -98,8 +94,7 @@ def restore(
         except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
             reason = str(error).strip().partition("\n")[0]
             got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
-            remedy = "Try the previous checkpoint: resume=FOLDER/checkpoint-previous.pt."
-            raise QPError.expected("checkpoint", got, "the state of this run", remedy) from error
+            raise QPError.expected("checkpoint", got, "the state of this run") from error
     if state["collector"] is None:
         replay.end_episodes()
     return tally
@@ -181,11 +176,7 @@ def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
 
 
 def configured(path: str | Path) -> Path:
-    """Return config.yaml of the run in ``path``, its folder or one of its checkpoints.
-
-    Raises:
-        QPError: there is none.
-    """
+    """Return config.yaml of the run in ``path``, its folder or one of its checkpoints."""
     config = Path(folder_of(str(path), "")) / "config.yaml"
     if not Path(path).exists():
         raise QPError.expected("resume", f"{path}, which does not exist", "a run's folder")
@@ -200,7 +191,7 @@ def check_fresh(folder: str | Path) -> None:
     remedy = "Choose another folder with hydra.run.dir=FOLDER."
     if (folder / "summary.json").exists():
         got = "which holds a finished run"
-    elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT, PREVIOUS)):
+    elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT)):
         got = "which holds a stopped run"
         with contextlib.suppress(Exception):  # damaged files raise errors of any type
             arguments = resume_arguments(folder, _stopped(folder)[0].task)

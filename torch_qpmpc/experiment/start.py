@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.blow_ups import without_blow_ups
 from torch_qpmpc.experiment.choosing import choose, chosen_before
+from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
@@ -43,9 +43,6 @@ class Exploration(nn.Module):
     At each step, each entry of each episode's action keeps its level or, with probability
     1 / ``hold``, gets a new one: a uniform level within the bounds ``(n_u,)`` or, if ``binary``,
     one of the bounds (a pseudo-random binary signal).
-
-    Raises:
-        QPError: a bound is infinite.
     """
 
     def __init__(self, low: Tensor, high: Tensor, hold: float, binary: bool, seed: int) -> None:
@@ -158,11 +155,7 @@ def transitions(start: Start | None, replay: Replay) -> list[TensorDictBase]:
 
 
 def read_observer(folder: Path) -> Innovations | None:
-    """Read the model of a run's observer; None if the run has none.
-
-    Raises:
-        QPError: the file is damaged.
-    """
+    """Read the model of a run's observer; None if the run has none."""
     path = folder / OBSERVER
     if not path.exists():
         return None
@@ -174,11 +167,7 @@ def read_observer(folder: Path) -> Innovations | None:
 
 
 def stored_log(path: str | Path) -> TensorDict:
-    """Read a log: a nested dict of tensors, written by ``torch.save``, as `collect_log` makes it.
-
-    Raises:
-        QPError: the file is missing, damaged, or not a log.
-    """
+    """Read a log of `collect_log`, a nested dict of tensors that ``torch.save`` wrote."""
     if not Path(path).exists():
         raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
     try:

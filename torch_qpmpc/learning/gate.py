@@ -61,9 +61,6 @@ class PairedTest:
     Attributes:
         pairs: the number of pairs.
 
-    Raises:
-        QPError: an argument is out of range.
-
     Example:
         >>> test = PairedTest()
         >>> test.add(torch.tensor([-3.0, 1.0]).repeat(32))
@@ -79,11 +76,7 @@ class PairedTest:
 
     @without_gradients
     def add(self, differences: Tensor) -> None:
-        """Add the differences ``(n,)`` of new pairs; an infinite one decides, as does a NaN.
-
-        Raises:
-            QPError: the shape does not fit.
-        """
+        """Add the differences ``(n,)`` of new pairs; an infinite one decides, as does a NaN."""
         check_tensor("differences", differences, len(differences), batched=False)
         new = differences.double().cpu().numpy()
         self._d = np.concatenate((self._d, new))
@@ -208,9 +201,6 @@ class Gate:
     Attributes:
         actor: the policy that is kept.
         accepted, rejected: the numbers of decisions.
-
-    Raises:
-        QPError: an argument is out of range.
 
     Example:
         >>> import torch_qpmpc as qm

@@ -4,14 +4,13 @@ With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, 
 
     min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
-by its dual; `learning.kernel` has that and D. Where C is not free, residuals r of your own add
-1/2 v |r + dr/dtheta dtheta|^2, with v the mean squared TD error.
+by its dual; `learning.kernel` has that and D.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,7 +19,6 @@ from torch import Tensor
 from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.kernel import (
-    FORGET,
     FRESH,
     Block,
     Dense,
@@ -36,7 +34,7 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import without_gradients
 from torch_qpmpc.qp.derivatives import envelope_gradients
-from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram
+from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solution import QPSolution
 
 #: A ratio of actual to predicted decrease below POOR raises the damping; one above GOOD lowers it.
@@ -87,15 +85,10 @@ class GaussNewton(torch.optim.Optimizer):
         trust_region: solve the batch again after each step and its projection (`QPMPC.project_`),
             with the targets fixed; undo a step that raised the squared errors, and adapt the
             damping to the ratio of actual to predicted decrease.
-        residuals: maps a QP to residuals r ``(M,)``, differentiable in its tensors, such as
-            ``lambda qp: 0.1 * qp.q``. 1/2 r'r at first order, times the mean squared TD error, is
-            added to the batch's sum of ``1/2 delta^2``. That mean rises at once and falls slowly,
-            like a size.
         weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
-        QPError: if a number is out of range, the scales do not fit the learned parts, or there are
-            residuals and C is free and learned.
+        QPError: if a number is out of range, or the scales do not fit the learned parts.
 
     Example:
         >>> import torch, torch_qpmpc as qm
@@ -118,7 +111,6 @@ class GaussNewton(torch.optim.Optimizer):
         damping: float = 0.03,
         td_error_clip: float | None = None,
         trust_region: bool = True,
-        residuals: Callable[[QuadraticProgram], Tensor] | None = None,
         weighted: bool = False,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
@@ -136,10 +128,7 @@ class GaussNewton(torch.optim.Optimizer):
         super().__init__(groups, {})
         self._mpc, self._least_damping = mpc, damping
         self._clip, self._trust_region = td_error_clip, trust_region
-        self._residuals, self._weighted = residuals, weighted
-        if residuals is not None and self._free_C() is not None:
-            remedy = "Pass a penalty of its rows to step."
-            raise QPError.expected("residuals", "them with a free C", "a tied C", remedy)
+        self._weighted = weighted
 
     @without_gradients
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -197,10 +186,9 @@ class GaussNewton(torch.optim.Optimizer):
         blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         scale(blocks, count)
         mu = damping_of(blocks, damping)
-        errors = torch.cat((delta, self._further(blocks, delta, count)))
-        alpha, change = solve_dual(blocks, errors, mu)
+        alpha, change = solve_dual(blocks, delta, mu)
         steps = [block.step(alpha) for block in blocks]
-        if not (objective(errors, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
+        if not (objective(delta, blocks).isfinite() and all(x.isfinite().all() for x in steps)):
             self._adapt(math.nan)
             for group in self.param_groups:
                 group |= FRESH
@@ -210,7 +198,7 @@ class GaussNewton(torch.optim.Optimizer):
             self._mpc.project_()
             return report(math.nan, True)
         old = [block.leaf.clone() for block in blocks]
-        ratio = self._try(blocks, steps, errors, change, (s, a, root, solution))
+        ratio = self._try(blocks, steps, delta, change, (s, a, root, solution))
         accepted = ratio > 0  # False for nan, which an infinite cost causes
         if not accepted:
             for block, value in zip(blocks, old, strict=True):
@@ -238,25 +226,24 @@ class GaussNewton(torch.optim.Optimizer):
         self,
         blocks: list[Block],
         steps: list[Tensor],
-        errors: Tensor,
+        delta: Tensor,
         change: Tensor,
         batch: tuple[Tensor, Tensor, Tensor, QPSolution],
     ) -> float:
         """Move and project theta; return the ratio of actual to predicted decrease.
 
-        ``change`` is the step's predicted one of the TD errors and residuals ``errors``; ``batch``
-        has s, a, the rows' factors, 0 if not usable, and the solution before the step.
+        ``change`` is the step's predicted one of the TD errors ``delta``; ``batch`` has s, a, the
+        rows' factors, 0 if not usable, and the solution before the step.
         """
         s, a, root, solution = batch
-        lr, before = self.param_groups[0]["lr"], objective(errors, blocks)
+        lr, before = self.param_groups[0]["lr"], objective(delta, blocks)
         _move(blocks, steps, lr)
         proposed = lr * change
         change = self._project(blocks, proposed)
-        predicted = before - objective(errors - change, blocks)
+        predicted = before - objective(delta - change, blocks)
         after = self._mpc.solve(s, a, warm_start=solution.active)
-        actual = change.clone()
-        actual[: len(root)] = root * torch.where(root > 0, after.value - solution.value, 0)
-        decrease = before - objective(errors - actual, blocks)
+        actual = root * torch.where(root > 0, after.value - solution.value, 0)
+        decrease = before - objective(delta - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
         lost = not torch.equal(change, proposed) and not decrease >= 0
         return float(decrease / predicted) if predicted > 0 else float(not lost)
@@ -290,7 +277,7 @@ class GaussNewton(torch.optim.Optimizer):
         proposed = [block.leaf.clone() for block in dense]
         self._mpc.project_()
         for block, leaf in zip(dense, proposed, strict=True):
-            change = change + block.rows[: len(change)] @ (block.leaf - leaf).flatten()
+            change = change + block.rows @ (block.leaf - leaf).flatten()
         return change
 
     def _adapt(self, ratio: float) -> None:
@@ -306,27 +293,6 @@ class GaussNewton(torch.optim.Optimizer):
         C, _ = matrix(self._mpc, "C")
         leaves = (leaf for group in self.param_groups for leaf in group["params"])
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
-
-    def _further(self, blocks: list[Block], delta: Tensor, count: int) -> Tensor:
-        """Append the gradients of the residuals to the TD errors'; return -r."""
-        if self._residuals is None or not blocks:
-            return delta.new_zeros(0)
-        group, variance = self.param_groups[0], float(delta.square().sum() / count)
-        if math.isfinite(variance):
-            group["variance"] = max(FORGET * group["variance"], variance)
-        with torch.enable_grad():
-            r = self._residuals(self._mpc.quadratic_program())
-            r = group["variance"] ** 0.5 * r.to(delta)
-        if not r.requires_grad:  # of parts that are not learned, or frozen
-            return delta.new_zeros(0)
-        leaves = [block.leaf for block in blocks]
-        unit = torch.eye(len(r)).to(r)
-        gradients = torch.autograd.grad(r, leaves, unit, is_grads_batched=True, allow_unused=True)
-        for block, rows in zip(blocks, gradients, strict=True):
-            assert isinstance(block, Dense)
-            rows = block.rows.new_zeros(len(r), 1) if rows is None else rows.flatten(1)
-            block.rows = torch.cat((block.rows, rows.expand(-1, block.rows.shape[1])))
-        return -r.detach()
 
     def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
         """Return Q's gradients in each learned part that is not frozen, times ``root``."""

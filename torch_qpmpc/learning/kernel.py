@@ -49,7 +49,7 @@ FLOOR = 1e-12
 #: Factor by which a size or a mean square can fall from one batch to the next.
 FORGET = 0.9
 #: The entries of a parameter group before the first batch.
-FRESH = {"size": 0.0, "signals": None, "variance": 0.0}
+FRESH = {"size": 0.0, "signals": None}
 
 
 class Dense:

@@ -65,11 +65,7 @@ class _QPOperator(TensorDictModuleBase):
         self.out_keys = out_keys  # pyright: ignore[reportAttributeAccessIssue]
 
     def known(self, tensordict: TensorDictBase) -> Tensor:
-        """Return p ``(*batch, n_p)``: the preview, if there is a key of it, and the observation.
-
-        Raises:
-            QPError: if an entry is missing.
-        """
+        """Return p ``(*batch, n_p)``: the preview, if there is a key of it, and the observation."""
         observation = entry(tensordict, self.in_keys[0])
         if self.preview_key is None:
             return observation
@@ -191,11 +187,7 @@ class QPActorValueOperator(_QPOperator):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write -Q(p, a) to the action value's key of ``tensordict``, and return it.
-
-        Raises:
-            QPError: if an entry is missing or does not fit.
-        """
+        """Write -Q(p, a) to the action value's key of ``tensordict``, and return it."""
         return self._set_value(tensordict, self.in_keys[1])
 
     def get_policy_operator(self, active_set_key: NestedKey | None = None) -> QPPolicyOperator:

@@ -153,9 +153,6 @@ class SystemIdentificationPenalty(nn.Module):
         """Return S ``(n_z + 1, n_z + 1)``: the penalty on windows ``(M, n_z)`` as a quadratic.
 
         It is ``1/2 tr(D S D')``, with D = [C, b].
-
-        Raises:
-            QPError: if a shape does not fit.
         """
         check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS_REMEDY)
         tau = F.pad(windows.to(torch.float64), (0, 1), value=-1.0)

@@ -4,12 +4,10 @@ The model of a nonlinear plant is
 
     x_{k+1} = sum_i w_i(x_k) (A_i x_k + B_i u_k + c_i),   w(x) = softmax(-|z - z_i|^2 / (2 h^2)),
 
-with the standardised observation z and the centres z_i (Johansen and Foss, 1993, "Constructing
-NARMAX models using ARMAX models"; Takagi and Sugeno, 1985). k-means finds the centres, from points
-far from each other. Each local model is fitted to all transitions, weighted by w_i, with a ridge on
-its change from the linear model of all. h is the mean distance of a centre from its nearest one.
-
-For a controller the model is linearised at s, with the derivative of the weights.
+with the standardised observation z and the centres z_i of k-means (Johansen and Foss, 1993,
+"Constructing NARMAX models using ARMAX models"; Takagi and Sugeno, 1985). Each local model is
+fitted to all transitions, weighted by w_i, with a ridge on its change from the linear model of all.
+h is the mean distance of a centre from its nearest one. A controller linearises the model at s.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from numbers import Integral
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -34,25 +32,14 @@ from torch_qpmpc.mpc.parameters import for_each
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.validation import as_tensor
 
-#: The numbers of centres among which the held-out prediction decides. More of them predict better
-#: still, but cost more in closed loops of the pendulum.
+#: The numbers of centres among which the held-out prediction decides.
 CENTRES = (1, 2, 4, 8, 16, 32)
 #: The log is cut into this many parts; the last one is held out.
 PARTS = 5
 #: The ridge on the changes of a local model, relative to the mean square of a regressor in the log.
 RIDGE = 1e-3
-#: Iterations of k-means.
-ITERATIONS = 50
 #: The distances of the rows of two matrices, exactly zero for equal ones.
 distance = partial(torch.cdist, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-class Linearised(NamedTuple):
-    """``x_{k+1} = A x_k + B u_k + offset``, each with the batch dimensions of s."""
-
-    A: Tensor
-    B: Tensor
-    offset: Tensor
 
 
 class BlendedModel(nn.Module):
@@ -66,11 +53,7 @@ class BlendedModel(nn.Module):
 
     Attributes:
         R2: the share of the outputs' variance that is predicted ``horizon`` steps ahead in the
-            held-out part of the log, by the number of centres; empty in one that is made from
-            arguments, as in a file.
-
-    Raises:
-        QPError: an argument has a wrong shape, or an entry is not finite.
+            held-out part of the log, by the number of centres; empty in a loaded model.
     """
 
     centres: Tensor
@@ -103,28 +86,13 @@ class BlendedModel(nn.Module):
         return (-self._distances(s).square().sum(-1) / 2).softmax(-1)
 
     def forward(self, s: Tensor, u: Tensor) -> Tensor:
-        """Return the next x ``(*batch, n_x)``, in float64.
-
-        Args:
-            s: ``(*batch, n_x)``.
-            u: ``(*batch, n_u)``.
-
-        Raises:
-            QPError: a shape is wrong.
-        """
+        """Return the next x ``(*batch, n_x)``, in float64, for u ``(*batch, n_u)``."""
         u = check_tensor("u", u, self.B.shape[-1]).to(self.B)
         local = self._drift(s) + torch.einsum("ijk,...k->...ij", self.B, u)
         return (self.weights(s).unsqueeze(-1) * local).sum(-2)
 
-    def linearised(self, s: Tensor) -> Linearised:
-        """Return the linear model that agrees with this one and its derivatives at (s, 0).
-
-        Args:
-            s: ``(*batch, n_x)``.
-
-        Raises:
-            QPError: a shape is wrong.
-        """
+    def linearised(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return A, B and the offset of the linearisation at (s, 0), with s ``(*batch, n_x)``."""
         local, w = self._drift(s), self.weights(s)
         ahead = (w.unsqueeze(-1) * local).sum(-2)
         # dw_i = w_i (de_i - sum_j w_j de_j), with the exponents e of the softmax.
@@ -132,18 +100,10 @@ class BlendedModel(nn.Module):
         slopes = w.unsqueeze(-1) * (slopes - (w.unsqueeze(-1) * slopes).sum(-2, keepdim=True))
         A = torch.einsum("...i,ijk->...jk", w, self.A) + local.mT @ slopes
         B = torch.einsum("...i,ijk->...jk", w, self.B)
-        return Linearised(A, B, ahead - (A @ s.to(A).unsqueeze(-1)).squeeze(-1))
+        return A, B, ahead - (A @ s.to(A).unsqueeze(-1)).squeeze(-1)
 
     def constraints(self, s: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
-        """Return C ``(*batch, N n_x, n_z)`` and b ``(*batch, N n_x)`` of `linearised` (eq:cband).
-
-        Args:
-            s: ``(*batch, n_x)``.
-            horizon: N.
-
-        Raises:
-            QPError: a shape is wrong.
-        """
+        """Return C ``(*batch, N n_x, n_z)`` and b ``(*batch, N n_x)`` at s (eq:cband)."""
         A, B, offset = self.linearised(s)
         C = for_each(partial(banded_matrix, horizon=horizon), (A, B), (2, 2))
         return C, -torch.cat([offset] * horizon, -1)
@@ -168,11 +128,7 @@ class BlendedModel(nn.Module):
 
 
 def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> BlendedModel:
-    """Return a copy of ``model``, which may be its arguments, for a `QPMPC` of sizes ``layout``.
-
-    Raises:
-        QPError: it is none, it has other sizes, or the QPMPC has a preview.
-    """
+    """Return a copy of ``model``, or of one with these arguments, for the sizes ``layout``."""
     if isinstance(model, BlendedModel):
         own = copy.deepcopy(model)
     elif isinstance(model, Mapping) and {*model} == {*BlendedModel.__annotations__}:
@@ -189,9 +145,7 @@ def schedule_of(model: BlendedModel | Mapping[str, Tensor], layout: Layout) -> B
 
 
 def identify_blended(
-    trajectories: Any,
-    horizon: int,
-    centres: int | Sequence[int] = CENTRES,
+    trajectories: Any, horizon: int, centres: int | Sequence[int] = CENTRES
 ) -> BlendedModel:
     """Fit linear models at a few centres to logged trajectories.
 
@@ -278,15 +232,12 @@ def _centres(z: Tensor, count: int) -> Tensor:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a centre without members stays
-        chosen = kmeans2(z.numpy(), chosen.numpy(), ITERATIONS, minit="matrix")[0]
+        chosen = kmeans2(z.numpy(), chosen.numpy(), 50, minit="matrix")[0]
     return torch.as_tensor(chosen)
 
 
 def _R2(model: BlendedModel, data: Sequence[Trajectory], horizon: int, variance: Tensor) -> float:
-    """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``.
-
-    Outputs whose ``variance`` ``(n_x,)`` is NaN are left out.
-    """
+    """Return R2 of predictions ``horizon`` steps ahead, or as many as the longest of ``data``."""
     horizon, errors = min(horizon, max(steps.steps for steps in data)), []
     for steps in data:
         starts = max(steps.steps - horizon + 1, 0)

@@ -193,9 +193,6 @@ def as_log(data: Any, n_x: int | None = None, n_d: int | None = None) -> Log:
             "observation")`` and, for ``n_d > 0``, ``preview``, whose first entries are d_k.
         n_x: the number of outputs, the last entries of ``observation``; None for all of them.
         n_d: entries of d_k.
-
-    Raises:
-        QPError: as in `read_log`, or the log has other sizes.
     """
     if _is_steps(data):
         return _named(_of_steps(data, n_x, 0 if n_d is None else n_d))

@@ -203,9 +203,6 @@ class QPMPC(nn.Module):
         Args:
             n_x, n_u, horizon, n_d: see `Layout`.
             options: the keyword arguments of `QPMPC` and of `Scheme.of`.
-
-        Raises:
-            QPError: an argument is invalid.
         """
         own = {x: options.pop(x) for x in (*KEYWORDS, "schedule") if x in options}
         return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
@@ -253,9 +250,6 @@ class QPMPC(nn.Module):
             trajectories, horizon, n_d, n_x: see `identify`.
             options: as in `of`, such as cost and bounds.
 
-        Raises:
-            QPError: as in `identify` and `QPMPC`, or there is neither a stage cost nor rewards.
-
         Example:
             >>> import torch, torch_qpmpc as qm
             >>> env = qm.envs.PointMassEnv(num_envs=4, max_steps=50, seed=0)
@@ -289,9 +283,6 @@ class QPMPC(nn.Module):
 
         Args:
             A, B, horizon, options: see `from_model`.
-
-        Raises:
-            QPError: as in `from_model`.
 
         Example:
             >>> import torch, torch_qpmpc as qm
@@ -554,10 +545,6 @@ class QPMPC(nn.Module):
         """Return the QPMPC that `save` wrote to ``path``, on the CPU, with all of theta.
 
         ``best.pt`` of a run's folder is such a file, if the policy is a QP.
-
-        Raises:
-            QPError: the file is missing or damaged, of another program or a newer release, or holds
-                more than tensors and plain values.
 
         Example:
             >>> import tempfile, torch_qpmpc as qm

@@ -38,9 +38,6 @@ def nearest_psd(H: Tensor) -> Tensor:
     An asymmetric H is replaced by its symmetric part. Semidefinite matrices stay the same to the
     last bit. Matrices with NaN or inf stay as well; the solve of the QP rejects them.
 
-    Raises:
-        QPError: H is not a floating-point tensor of square matrices.
-
     Example:
         >>> import torch
         >>> nearest_psd(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))

@@ -27,10 +27,6 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
         A, B: the model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
         W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
         gamma: discount of the stage costs.
-
-    Raises:
-        QPError: a shape does not fit, W is not positive semidefinite, or the Riccati equation
-            has no stabilising solution.
     """
     check_tensor("A", A, "n_x", "n_x", batched=False)
     n_x = len(A)

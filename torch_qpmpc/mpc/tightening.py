@@ -23,7 +23,6 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
 from torch_qpmpc.mpc.validation import without_gradients
 
 
@@ -94,41 +93,6 @@ def tighten(
     crossed = lb > ub
     mpc.lb.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, lb), mpc.lb))
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
-
-
-@without_gradients
-def back_off(mpc: QPMPC, W: Tensor, probability: float = 0.95) -> None:
-    """Tighten soft rows for a noise of covariance W, and change ``mpc`` in place.
-
-    The regulator of the model and the stage cost feeds the prediction's errors back; if their
-    Riccati equation has no solution, nothing does.
-
-    Args:
-        mpc: the QPMPC with its nominal bounds and a tied C.
-        W: ``(n_x, n_x)``.
-        probability: as in `tighten`.
-
-    Raises:
-        QPError: as in `tighten`, or the QPMPC has a free C.
-
-    Example:
-        >>> import torch_qpmpc as qm
-        >>> one = torch.ones(1, 1)
-        >>> mpc = qm.QPMPC.from_model(
-        ...     one, one, 2, structure="tied", stage_weight=[1.0, 1.0], state_bounds=([-5], [5])
-        ... )
-        >>> back_off(mpc, 0.25 * one)
-        >>> mpc.ub[mpc.soft].numpy().round(3)
-        array([5.   , 4.178, 4.12 ])
-    """
-    check_kind("mpc", mpc, QPMPC)
-    check_tensor("W", W, mpc.n_x, mpc.n_x, batched=False)
-    A, B, *_ = (x.to(W) for x in mpc.model())
-    try:
-        K = -lqr_gain(A, B, stage_weight(mpc).to(W))
-    except QPError:
-        K = W.new_zeros(mpc.n_u, mpc.n_x)
-    tighten(mpc, prediction_covariance(A + B @ K, W, mpc.horizon), probability, K)
 
 
 def _row_variance(mpc: QPMPC, covariances: Tensor, K: Tensor) -> Tensor:

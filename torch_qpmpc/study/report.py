@@ -19,7 +19,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.costs import cost_text
+from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.study import plots
 from torch_qpmpc.study.markdown import escaped, replaced, table

@@ -86,7 +86,7 @@ class FinishedRun:
     @cached_property
     def start(self) -> QPMPC:
         """The QP that learning started from."""
-        return QPMPC.of(**{**self.policy.arguments, "structure": self.cfg.constraint.structure})
+        return QPMPC.of(**self.policy.arguments)
 
     @cached_property
     def true(self) -> QPMPC | None:

@@ -66,9 +66,6 @@ def spread(
     Returns:
         The ends, each ``(...)``.
 
-    Raises:
-        QPError: a stratum is empty.
-
     Example:
         >>> spread([np.array([0.7, 0.9, 0.8])]).text(".1f")
         '(range of 3: 0.7 to 0.9)'

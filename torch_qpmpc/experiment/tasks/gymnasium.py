@@ -11,10 +11,17 @@ from pydantic import AfterValidator
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import Count, Matrix, Whole
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks.code import has_run
-from torch_qpmpc.experiment.tasks.registry import Task, TaskSettings, plant_scheme, register
+from torch_qpmpc.experiment.tasks.registry import (
+    Count,
+    Matrix,
+    Task,
+    TaskSettings,
+    Whole,
+    plant_scheme,
+    register,
+)
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 

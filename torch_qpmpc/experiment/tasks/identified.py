@@ -13,9 +13,9 @@ from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torch_qpmpc.envs import KalmanFilter, LinearSystem, Plant
+from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.blow_ups import without_blow_ups
+from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
 from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
@@ -23,16 +23,21 @@ from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.identification import Identified, check_excitation, measured_model
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import NEXT, as_log, cuts, valid_steps
+from torch_qpmpc.mpc.log import as_log, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.projections import nearest_psd
 from torch_qpmpc.mpc.rewards import GOOD, fit_rewards, poor, scheme_cost
-from torch_qpmpc.mpc.riccati import affine_cost_to_go, terminal_riccati
+from torch_qpmpc.mpc.riccati import (
+    affine_cost_to_go,
+    lqr_gain,
+    stage_weight,
+    terminal_riccati,
+)
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.stage_cost import StageCost
 from torch_qpmpc.mpc.subspace import fit_state_space
-from torch_qpmpc.mpc.tightening import back_off
+from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 if TYPE_CHECKING:
     from torch_qpmpc.experiment.choosing import Choice
@@ -139,27 +144,6 @@ def identified_start(
     return start._replace(cost=fit_rewards(log, start.layout, diagonal, model))
 
 
-def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:
-    """Return a log, ``(T,)`` or ``(episodes, T)``, with estimates in the place of its outputs.
-
-    They begin anew where a trajectory of `as_log` does.
-    """
-    rows = log if log.batch_dims == 2 else log.unsqueeze(0)
-    y, following, u = (rows[key].double() for key in ("observation", NEXT, "action"))
-    n_d = observer.E.shape[-1]
-    d = rows["preview"][..., :n_d].double() if n_d else u[..., :0]
-    (_, ends), model, pairs = cuts(rows), KalmanFilter(observer), []
-    first, step = model.first(y), torch.zeros(len(y), dtype=torch.int64)
-    x = first[:, 0]
-    for k in range(y.shape[1]):
-        after = model.following(x, u[:, k], d[:, k], following[:, k], step + 1)
-        pairs.append((x, after))
-        x = torch.where(ends[:, k, None], first[:, (k + 1) % y.shape[1]], after)
-        step = torch.where(ends[:, k], 0, step + 1)
-    now, after = (torch.stack(part, 1).reshape(*log.shape, -1) for part in zip(*pairs, strict=True))
-    return log.clone(recurse=False).set("observation", now).set(NEXT, after)
-
-
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
     cost = scheme.cost
@@ -181,9 +165,6 @@ def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
     """Return ``cost``, fitted to a log, with the regulator's cost to go at x_N.
 
     With known signals, that is the cost about the x of least stage cost for them.
-
-    Raises:
-        QPError: as in `terminal_riccati`.
     """
     layout, model = start.layout, start.model
     A, B, offset = (torch.tensor(part) for part in (model.A, model.B, model.offset))
@@ -244,10 +225,7 @@ def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBa
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a
     second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
     the covariance of the prediction errors, so that it holds with a probability of 95 % with the
-    feedback of `back_off`. ``data`` are logs as in `identify`.
-
-    Raises:
-        QPError: the steps identify no model.
+    regulator's feedback, if there is one. ``data`` are logs as in `identify`.
     """
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
@@ -269,5 +247,10 @@ def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBa
     ]
     for mpc in mpcs:
         if (mpc.soft & (mpc.lb.isfinite() | mpc.ub.isfinite())).any():
-            back_off(mpc, torch.tensor(model.S))
+            A, B, *_ = mpc.model()
+            K = torch.zeros(B.mT.shape).to(A)
+            with suppress(QPError):
+                K = -lqr_gain(A, B, stage_weight(mpc))
+            errors = prediction_covariance(A + B @ K, torch.tensor(model.S), mpc.horizon)
+            tighten(mpc, errors, K=K)
     return mpcs

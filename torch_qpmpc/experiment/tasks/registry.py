@@ -5,24 +5,46 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Self
+from typing import Annotated, Any, Literal, NoReturn, Self
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
-from pydantic import ConfigDict, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.fields import Count, Fraction, Group, Weight
 from torch_qpmpc.experiment.rivals import Policy
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
+
+
+class Group(BaseModel):
+    """A group of keys that forbids unknown keys, converts no values, and takes finite numbers."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def _equally_long(rows: list[list[float]]) -> list[list[float]]:
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
+        raise ValueError("rows should be equally long")
+    return rows
+
+
+Whole = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+#: Weight of a slack; inf makes the row hard.
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=True)]
+Matrix = Annotated[list[list[float]], AfterValidator(_equally_long)]
+
 
 #: A plant of any kind.
 AnyPlant = LinearSystem | GymnasiumPlant | Plant
@@ -176,9 +198,6 @@ def find_task(settings: Mapping[str, Any]) -> Task:
     """Find a task by the keys under ``task``; no code runs.
 
     A task whose script has not run in this process has no plant: see `code.run_code`.
-
-    Raises:
-        QPError: there is no such task.
     """
     name, file = settings.get("name"), settings.get("file")
     if name in TASKS:
