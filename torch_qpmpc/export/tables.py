@@ -20,7 +20,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
-from torch_qpmpc.qp.pipeline.scaling import lengths
+from torch_qpmpc.qp.pipeline.scaling import ROUNDING, lengths
 from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, Status, crossed
 from torch_qpmpc.qp.solve import solve_qp
 
@@ -117,9 +117,13 @@ def make_tables(mpc: QPMPC) -> Tables:
     n_p, n_u = mpc.n_p, mpc.n_u
     H = (H + H.T) / 2
     # In units of the free entries of z that equilibrate H, C and G; p, u_0 and y keep their own.
+    # Rows of C are scaled by their free entries: those of p may be in any unit.
     units = lengths(H[None], np.concatenate((C, G))[None])[0]
+    sizes = np.abs(C * units)
+    free = sizes[:, n_p:].max(-1, initial=0.0)
+    has_free = free > ROUNDING * sizes.max(-1, initial=0.0)
     units[:n_p] = 1.0
-    of_C = np.maximum(np.abs(C * units).max(-1, initial=0.0), TINY)
+    of_C = np.where(has_free, free, np.maximum(np.abs(C * units).max(-1, initial=0.0), TINY))
     original, H, q, C, b, G = (
         G,
         H * np.outer(units, units),
