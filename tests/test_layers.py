@@ -69,7 +69,7 @@ BUDGET = {
     "control": 4312,
     "envs": 1477,
     "experiment": 3435,
-    "export": 1441,
+    "export": 1445,
     "learning": 2776,
     "mpc": 5253,
     "proofs": 1003,
