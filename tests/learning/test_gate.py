@@ -62,11 +62,10 @@ def test_the_bound_comes_from_earlier_pairs_and_grows_with_the_tail_of_losses():
 #: Candidates that are no better: the mean difference is zero, with losses in the tail.
 NO_BETTER = {
     "normal": lambda n, g: torch.randn(n, generator=g),
-    "lognormal 1": lambda n, g: torch.randn(n, generator=g).exp() - math.exp(0.5),
     "lognormal 2": lambda n, g: (2 * torch.randn(n, generator=g)).exp() - math.exp(2.0),
-    "fails 1 in 50": lambda n, g: (torch.rand(n, generator=g) < 0.02).double() - 0.02,
     "fails 1 in 200": lambda n, g: (torch.rand(n, generator=g) < 0.005).double() - 0.005,
 }
+TESTS = 150
 LOOKS = {"batches": range(32, 97, 32), "pairs": range(16, 201, 23)}
 
 
@@ -74,33 +73,33 @@ LOOKS = {"batches": range(32, 97, 32), "pairs": range(16, 201, 23)}
     ("family", "looks"), zip(NO_BETTER, itertools.cycle(("pairs", "batches")), strict=False)
 )
 def test_a_candidate_that_is_no_better_is_accepted_with_probability_alpha_at_most(family, looks):
-    assert accepted(NO_BETTER[family], LOOKS[looks], None) <= 0.05 * 300
+    assert accepted(NO_BETTER[family], LOOKS[looks], None) <= 0.05 * TESTS
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.005])
-def test_a_bound_covers_failures_that_are_hidden_by_noise(rate):
+def test_a_bound_covers_failures_that_are_hidden_by_noise():
     """Beside noise they leave no trace: with a bound only is the test right."""
+    rate = 0.005
 
     def fails(n: int, g: torch.Generator) -> Tensor:
         noise = 0.1 * rate * torch.randn(n, generator=g)
         return (torch.rand(n, generator=g) < rate).double() - rate + noise
 
-    assert accepted(fails, LOOKS["batches"], 1.1) <= 0.05 * 300
-    assert accepted(fails, LOOKS["batches"], None) > 0.2 * 300
+    assert accepted(fails, LOOKS["batches"], 1.1) <= 0.05 * TESTS
+    assert accepted(fails, LOOKS["batches"], None) > 0.2 * TESTS
 
 
-def accepted(draw: Any, looks: range, bound: float | None, alpha: float = 0.05) -> int:
-    """Count the tests of 300 that accept at some look."""
-    count, generator = 0, torch.Generator().manual_seed(0)
-    for _ in range(300):
-        test, d, seen = PairedTest(alpha, bound), draw(max(looks), generator).double(), 0
+def accepted(draw: Any, looks: range, bound: float | None, count: int = TESTS) -> int:
+    """Count the tests that accept at some look."""
+    better, generator = 0, torch.Generator().manual_seed(0)
+    for _ in range(count):
+        test, d, seen = PairedTest(bound=bound), draw(max(looks), generator).double(), 0
         for look in looks:
             test.add(d[seen:look])
             seen = look
             if test.decision != "open":
                 break
-        count += test.decision == "better"
-    return count
+        better += test.decision == "better"
+    return better
 
 
 @pytest.mark.parametrize(("effect", "share"), [(0.3, 0.27), (0.5, 0.85), (1.0, 0.99)])
@@ -108,7 +107,7 @@ def test_a_better_candidate_is_accepted_within_96_pairs(effect, share):
     def draw(n: int, g: torch.Generator) -> Tensor:
         return torch.randn(n, generator=g) - effect
 
-    assert accepted(draw, LOOKS["batches"], None) >= share * 300
+    assert accepted(draw, LOOKS["batches"], None, 300) >= share * 300
 
 
 @pytest.mark.parametrize("bound", [None, 20.0])
@@ -131,16 +130,16 @@ def test_equal_differences_say_nothing_without_a_bound():
 
 
 def test_the_interval_covers_the_mean_at_all_times():
-    """Of 200 sequences, looked at after each 16 pairs up to 400, at most 5 % miss the mean."""
+    """Of the sequences, looked at after each 16 pairs up to 400, at most 5 % miss the mean."""
     missed = 0
-    for seed in range(200):
+    for seed in range(TESTS):
         test, d = PairedTest(0.05), normal(400, 0.0, seed)
         decisions = set()
         for part in d.split(16):
             test.add(part)
             decisions.add(test.decision)
         missed += decisions != {"open"}
-    assert missed <= 0.05 * 200
+    assert missed <= 0.05 * TESTS
 
 
 def test_few_pairs_decide_nothing():

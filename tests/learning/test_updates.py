@@ -167,13 +167,15 @@ def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty):
     return first_order(mpc, loss, optimizer, deviation, None), optimizer
 
 
-@pytest.mark.parametrize("rule", ["cholesky", "projection"])
-@pytest.mark.parametrize("optimizer", ["sgd", "adam", "gauss_newton"])
+@pytest.mark.parametrize(
+    ("optimizer", "rule"),
+    [("sgd", "cholesky"), ("adam", "projection"), ("gauss_newton", "cholesky")],
+)
 def test_the_proximal_step_holds_entries_above_the_band_at_zero(optimizer, rule):
     mpc = random_mpc(3, free=0.0, step=rule)
     deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-5)
     update, _ = make_update(optimizer, mpc, deviation)
-    for seed in range(20):
+    for seed in range(5):
         update(transitions(seed=seed), None)
     moved = (mpc.C - mpc.C_0).detach().abs()
     above, below = deviation.C_mask == 1, deviation.C_mask == 0

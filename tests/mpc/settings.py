@@ -83,9 +83,6 @@ def rows() -> Tensor:
 
 PAPER: dict[str, dict[str, Any]] = {
     "diagonal": {"hessian": "diagonal"},
-    "block": {"hessian": "block"},
-    "full": {"hessian": "full"},
-    "all soft": {"action_slack": 50.0},
     "weak slack": {"state_slack": 0.5, "action_slack": 0.1},
     "discounted slack": {"discount_slack": True, "action_slack": 50.0},
     "hard states": {"state_slack": torch.inf, "state_bounds": ([-9.0, -9.0], [9.0, 9.0])},
@@ -94,17 +91,13 @@ PAPER: dict[str, dict[str, Any]] = {
     "of one stage": {"horizon": 1},
     "varying, mixed": {"structure": "varying", "learn": ("C", "G", "w"), **MIXED},
     "free, mixed": {"learn": ("C", "G", "w"), "action_slack": 50.0, **MIXED},
-    "undiscounted": {"gamma": 1.0},
-    "projected": {"step": "projection", "learn": EVERYTHING, "action_slack": 50.0},
     "projected block": {"step": "projection", "hessian": "block", "learn": ("H", "H_f", "C", "w")},
     "by proxqp": {"solver": "proxqp"},
     "masked": {"learn": {"H": True, "c": True, "C": rows()}},
 }
 LINEAR: dict[str, dict[str, Any]] = {
     "tied": {},
-    "varying": {"structure": "varying"},
-    "tied, mixed": MIXED,
-    "tied, varying, mixed": {"structure": "varying", **MIXED},
+    "varying, mixed rows": {"structure": "varying", **MIXED},
     "tied, diagonal": {"hessian": "diagonal", "stage_weight": [1.0, 0.5, 0.1]},
     "tied, full": {"hessian": "full"},
     "hard rows": {"constraint_slack": torch.inf, "constraints": ([[0.0, 0, 1]], [-0.4], [0.4])},
@@ -112,15 +105,9 @@ LINEAR: dict[str, dict[str, Any]] = {
 PREVIEWED: dict[str, dict[str, Any]] = {
     "preview": {},
     "preview, full": {"hessian": "full"},
-    "preview, diagonal": {"hessian": "diagonal"},
     "preview, tied": {"structure": "tied"},
-    "preview, tied, full": {"structure": "tied", "hessian": "full"},
-    "preview, varying": {"structure": "varying"},
     "preview, varying, full": {"structure": "varying", "hessian": "full"},
     "preview, projected": {"structure": "tied", "hessian": "diagonal", "step": "projection"},
-    "preview, sdp": {"step": "sdp"},
-    "preview, full, projected": {"structure": "varying", "hessian": "full", "step": "projection"},
-    "preview, proxqp": {"structure": "tied", "step": "projection", "solver": "proxqp"},
     "preview, torch": {"solver": "torch"},
 }
 SETTINGS = {
