@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.analysis.structure import PredictionForm, prediction_form
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs

@@ -34,7 +34,7 @@ from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassG
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
 from torch_qpmpc.mpc.riccati import lqr_gain
 

@@ -26,7 +26,7 @@ from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, priced, register
 from torch_qpmpc.experiment.tasks.registry import NonNegative
-from torch_qpmpc.mpc.banded import band_distance
+from torch_qpmpc.mpc.layout import band_distance
 
 DT, DAY = 0.25, 96  # hours of a step, steps of a day
 PRICE, LOWER, UPPER, OUTDOOR, GAIN = range(5)  # positions in w

@@ -9,7 +9,7 @@ from torch import Tensor
 from tests.problems import normal, predict, times
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.structure import prediction_form
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 N_X, N_U, N = 3, 2, 5
 OFFSET = normal(N, N_X, seed=7)

@@ -32,8 +32,7 @@ from torch_qpmpc.analysis.structure import (
     stage_models,
     toeplitz_defect,
 )
-from torch_qpmpc.mpc.banded import band_distance, banded_matrix
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, band_distance, banded_matrix
 from torch_qpmpc.mpc.riccati import stage_weight
 
 pytestmark = pytest.mark.layout

@@ -26,7 +26,7 @@ from torch_qpmpc.analysis.structure import (
     stage_models,
     toeplitz_defect,
 )
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 N_X, N_U, N = 3, 2, 4
 generator = torch.Generator().manual_seed(0)

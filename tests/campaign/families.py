@@ -18,7 +18,7 @@ from tests.campaign.draws import FLOAT32, Case, Draw, changed, solvable
 from tests.campaign.trained import trained
 from tests.problems import BRINK, HARD_ROWS, SOFT_ROWS, WEAK, KnownQP, times
 from torch_qpmpc import QuadraticProgram, Status
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 
 def well_posed(draw: Draw, count: int) -> Case:

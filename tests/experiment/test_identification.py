@@ -20,8 +20,8 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpcs
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.identification import identify
-from torch_qpmpc.mpc.rewards import fit_rewards
 from torch_qpmpc.mpc.riccati import terminal_riccati
+from torch_qpmpc.mpc.stage_cost import fit_rewards
 
 DATA = ("start=data", "start.transitions=400", "solver=daqp")
 #: Short episodes: without control the plant is unstable.

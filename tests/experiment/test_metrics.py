@@ -16,7 +16,7 @@ from torch_qpmpc.experiment.metrics import report, structure_summary, table, the
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 
 def evaluation(start: float, learned: float, true: float, **rivals: float) -> Evaluation:

@@ -35,7 +35,7 @@ from torch_qpmpc.experiment.tasks import (
     run_code,
 )
 from torch_qpmpc.experiment.tasks.code import named_code, named_task, resume_arguments
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,7 @@ from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.launch import LOCK, locked
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_physics
-from torch_qpmpc.mpc.banded import band_distance
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, band_distance
 
 
 def run_small(folder: Path, *overrides: str) -> dict[str, Any]:

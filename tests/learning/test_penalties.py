@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from torch_qpmpc import DeviationPenalty, QPError, SystemIdentificationPenalty
 from torch_qpmpc.envs import PointMass
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 
 N_X, N_U, N = 2, 1, 4
 N_Z = N * (N_X + N_U) + N_X

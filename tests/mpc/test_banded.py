@@ -5,8 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from torch_qpmpc import QPError
-from torch_qpmpc.mpc.banded import band_distance, banded_matrix
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, band_distance, banded_matrix
 
 N_X, N_U, N = 3, 2, 4
 

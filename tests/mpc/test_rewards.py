@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from torch_qpmpc import QPMPC, Model, QPError, Scheme
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
+from torch_qpmpc.mpc.stage_cost import fit_rewards, scheme_cost
 
 LAYOUT = Layout(2, 1, 3)
 W = torch.tensor([[2.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, 0.3]]).double()

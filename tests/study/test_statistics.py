@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import trim_mean
 
 from torch_qpmpc import QPError
-from torch_qpmpc.study.statistics import interquartile_mean, spread, spread_name
+from torch_qpmpc.study.statistics import interquartile_mean, spread
 
 
 @pytest.fixture
@@ -71,5 +71,3 @@ def test_fewer_than_six_values_in_a_stratum_have_a_range(rng):
 def test_a_spread_is_called_what_it_is():
     assert spread([np.arange(3.0)]).text(".1f") == "(range of 3: 0.0 to 2.0)"
     assert spread([np.full(6, 0.25)]).text() == "[0.250, 0.250]"
-    names = [spread_name(counts) for counts in ([3, 5], [6, 10], [3, 10])]
-    assert names == ["range", "95% interval", "95% interval (range of fewer than six)"]

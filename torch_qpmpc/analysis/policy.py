@@ -1,8 +1,6 @@
 """The policy in terms of control engineering: its gain, and its regions of one active set each.
 
-On each of these regions of the state space the policy is affine in the state. Its slope is the
-gradient of the QP's solution (see `torch_qpmpc.qp.derivatives`). With a preview, the state s is
-all that V fixes, p ``(n_p,)``.
+With a preview, the state s is all that V fixes, p ``(n_p,)``.
 """
 
 from __future__ import annotations

@@ -163,9 +163,7 @@ def read(
 def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) -> dict[str, float]:
     """Return the numbers of `read` that measure the distance to an MPC scheme, for logs.
 
-    Returns:
-        ``causality_defect``, ``toeplitz_defect``, ``distance_to_mpc`` and, with a true model,
-        ``model_error``; all nan if C has no prediction form, so that training continues.
+    All are nan if C has no prediction form, so that training continues.
     """
     check_kind("mpc", mpc, QPMPC)
     true = None if true_model is None else _checked_model(mpc, true_model)

@@ -22,8 +22,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import band_distance
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, band_distance
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import without_gradients
 
@@ -89,7 +88,7 @@ def prediction_form(
     """Solve ``C z = b`` for x_1, .., x_N.
 
     Args:
-        C: ``(*batch, N n_x, n_z)``; n_z is N (n_x + n_u) + n_x without a preview.
+        C: ``(*batch, N n_x, n_z)``.
         n_x, n_u, n_d: numbers of states, actions and entries of d_k, as in `QPMPC`.
         b: ``(*batch, N n_x)``; zero by default.
 
@@ -99,7 +98,7 @@ def prediction_form(
 
     Example:
         >>> import torch
-        >>> from torch_qpmpc.mpc.banded import banded_matrix
+        >>> from torch_qpmpc.mpc.layout import banded_matrix
         >>> C_0 = banded_matrix(torch.tensor([[0.5]]), torch.tensor([[1.0]]), 3)
         >>> T = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 3.0], [1.0, 0.0, 1.0]])
         >>> form = prediction_form(T @ C_0, 1, 1)
@@ -144,10 +143,9 @@ def canonical(mpc: QPMPC) -> Tensor:
 def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
 
-    From each row block of ``[Phi, Gamma, -I]``, A_k times the block before it is subtracted. For an
-    MPC scheme only the band remains, C_0. In general, a row's other entries are what x_k, u_k and
-    d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is C
-    ``(N n_x, n_z)`` and b ``(N n_x,)``.
+    For an MPC scheme only the band remains, C_0; else a row's other entries are what x_k, u_k and
+    d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is
+    C ``(N n_x, n_z)`` and b ``(N n_x,)``.
     """
     _check_form(form)
     n_x, N = form.layout.n_x, form.layout.horizon
@@ -252,10 +250,9 @@ def stage_models(form: PredictionForm) -> NearestModel:
 def nearest_model(form: PredictionForm) -> NearestModel:
     """Fit the time-invariant scheme with the nearest predictions; its residual is the distance.
 
-    Minimises ``||[Phi, Gamma, phi] - [Phi, Gamma, phi](A, B, E, offset)||`` by trust-region steps
-    from the one-step fit of all stages; the residual is the minimum over ``||[Phi, Gamma]||``, zero
-    for a scheme with tied stages. In general it is that of a local minimum, an upper bound on the
-    distance to the MPC schemes.
+    Trust-region steps from the one-step fit of all stages minimise ``||[Phi, Gamma, phi] - [Phi,
+    Gamma, phi](A, B, E, offset)||``; the residual is that over ``||[Phi, Gamma]||``, of a local
+    minimum: an upper bound on the distance to the MPC schemes.
     """
     _check_form(form)
     maps, pairs = form.maps, _pairs(form)
@@ -347,8 +344,8 @@ def one_step_error(
         model: the model, with tensors ``(*batch, ..)``, such as one per stage.
         A, B: the true model, ``(n_x, n_x)`` and ``(n_x, n_u)``.
         offset: the true offset, the mean of the noise, ``(n_x,)``; zero by default.
-        moment: `second_moment` of the distribution; by default independent entries with mean 0 and
-            variance 1, for which the error is the Frobenius norm of the difference.
+        moment: `second_moment` of the distribution; by default that of independent entries with
+            mean 0 and variance 1.
         E: the true ``(n_x, n_d)``; zero by default.
 
     Returns:

@@ -61,17 +61,10 @@ LARGEST = 2.0
 PAGE = """<!doctype html>
 <meta charset="utf-8">
 <title>Review of a controller</title>
-<style>
-body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
-td, th {{ text-align: left; vertical-align: top; padding: 0.2em 1em 0.2em 0 }}
-img {{ max-width: 100% }}
-</style>
+<style>body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
+td {{ vertical-align: top; padding: 0.2em 1em 0.2em 0 }} img {{ max-width: 100% }}</style>
 <h1>Review of a controller</h1>
-<table>
-<tr><th>Finding</th><th></th><th>Numbers</th><th>Remedy</th></tr>
-{table}
-</table>
-{images}
+<table><tr><th>Finding<th><th>Numbers<th>Remedy{table}</table>{images}
 """
 
 
@@ -123,24 +116,16 @@ class Review:
         return "\n".join(lines)
 
     def to_html(self, path: str | Path, *figures: Figure) -> None:
-        """Write a page with a table of the findings and ``figures`` below it, such as a `Run`'s.
-
-        It is one file, and loads nothing from elsewhere.
-
-        Raises:
-            OSError: writing failed.
-        """
-        rows = [(x.name, "ok" if x.ok else "fault", x.text, x.remedy) for x in self.findings]
-        table = "\n".join(
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-            for row in rows
-        )
-        images = []
+        """Write one page with a table of the findings and ``figures``, such as a `Run`'s."""
+        table = images = ""
+        for x in self.findings:
+            cells = (x.name, "ok" if x.ok else "fault", x.text, x.remedy)
+            table += "\n<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
         for figure in figures:
             figure.savefig(buffer := BytesIO(), format="png")
             data = base64.b64encode(buffer.getvalue()).decode()
-            images.append(f'<img alt="" src="data:image/png;base64,{data}">')
-        Path(path).write_text(PAGE.format(table=table, images="\n".join(images)), encoding="utf-8")
+            images += f'\n<img alt="" src="data:image/png;base64,{data}">'
+        Path(path).write_text(PAGE.format(table=table, images=images), encoding="utf-8")
 
 
 def review(

@@ -77,8 +77,7 @@ def closed_loop(
 ) -> ClosedLoop:
     """Run ``policy`` from ``starts`` fixed starts side by side, without gradients.
 
-    The seed determines the experiment: ``numpy.random.default_rng(seed)`` draws the starts, then at
-    each step the numbers ``(starts, n_noise)`` of the noise.
+    ``numpy.random.default_rng(seed)`` draws the starts, then each step's noise.
 
     Args:
         policy: maps states ``(starts, n_x)`` in float64 to actions ``(starts, n_u)``.
@@ -125,16 +124,9 @@ def plant_loop(
 ) -> ClosedLoop:
     """Run ``policy`` as `closed_loop` does, on a `Plant`.
 
-    The seed determines the experiment: ``numpy.random.default_rng(seed)`` draws the signals
-    ``(starts, steps + N + 1, n_w)``, then the starts.
-
-    Args:
-        policy: maps p ``(starts, n_p)`` in float64, the known signals d_k, .., d_{k+N} and the
-            output or the estimate of the state, to actions ``(starts, n_u)``. If it has a method
-            ``begin(plant, x, w)``, that is called first, with the true start states x and all
-            signals w, for rivals that see them and filters that need a reset.
-        plant: the plant.
-        steps, starts, seed, gamma: as in `closed_loop`.
+    ``numpy.random.default_rng(seed)`` draws the signals ``(starts, steps + N + 1, n_w)``, then the
+    starts. ``policy`` maps p ``(starts, n_p)`` to actions. If it has a method ``begin(plant, x,
+    w)``, that is called first, with the true start states x and all signals w.
     """
     _check(policy, steps, starts, seed, gamma)
     check_kind("plant", plant, Plant, "Use closed_loop for a LinearSystem.")
@@ -176,7 +168,7 @@ def gymnasium_loop(
     """Run ``policy`` as `closed_loop` does, in a Gymnasium environment; start i has seed + i.
 
     After an episode's end its state stays constant, at no cost. ``steps`` is by default the length
-    of the environment's own episodes. The policy is not called once all episodes have ended.
+    of the environment's own episodes.
     """
     check_kind("plant", plant, GymnasiumPlant, "Use closed_loop for a LinearSystem.")
     steps = plant.max_steps if steps is None else steps

@@ -23,9 +23,8 @@ class KalmanFilter(Transform):
     """A TorchRL transform that turns an output y into the estimate of a model's state.
 
     The estimate before the first output is the model's ``x0``; an output that is NaN corrects
-    nothing. The transform has no state: each estimate follows from the last one, the action that
-    the transformed environment receives, and the new output. The entry ``filter_step`` counts the
-    steps of an episode, by which the gain varies.
+    nothing. The transform has no state: each estimate follows from the last one, the action and the
+    new output. The entry ``filter_step`` counts the steps of an episode, by which the gain varies.
 
     Args:
         model: the model.

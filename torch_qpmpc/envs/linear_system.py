@@ -1,9 +1,6 @@
-"""Linear systems with additive noise, with their Gymnasium and TorchRL environments.
+"""Linear systems s+ = A s + B a + nu, with their Gymnasium and TorchRL environments.
 
-    s+ = A s + B a + nu
-
-A concrete plant defines the cost, the noise and the starts. Both environments return the reward
--L(s, a), because the paper minimises a cost.
+A concrete plant defines the cost L, the noise nu and the starts. Rewards are -L(s, a).
 """
 
 from __future__ import annotations

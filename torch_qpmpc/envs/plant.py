@@ -126,12 +126,8 @@ class PlantEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` episodes of a `Plant`, as in `VectorisedEnv`.
 
     It emits the output y as ``observation`` ``(num_envs, n_y)``, and the known signals d_k, ..,
-    d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The transform
-    `KalmanFilter` turns the observation into an estimate of the state.
-
-    The seed draws the signals of ``episodes`` episodes; each reset chooses one of them at random.
-    Hidden entries are ``state`` ``(num_envs, n_x)`` in float64, ``episode``, the index of the
-    signals, ``step_count`` and ``violation``, each ``(num_envs, 1)``.
+    d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The seed draws the signals
+    of ``episodes`` episodes; each reset chooses one of them at random.
 
     Args:
         plant: the plant.

@@ -18,12 +18,8 @@ class VectorisedEnv(EnvBase):
     """``num_envs`` episodes side by side, without a Python loop; none of them terminates.
 
     Its only state is the generator. Whatever else a step needs travels in the TensorDict as hidden
-    entries beside the observation, ``step_count`` ``(num_envs, 1)`` among them. At a partial reset,
-    TorchRL's merging by mask therefore restarts exactly the episodes that are reset. A policy must
-    not read the hidden entries.
-
-    Episodes are truncated at ``max_steps`` (no ``StepCounter`` needed), so that a collector resets
-    them and changes their trajectory ids.
+    entries beside the observation, ``step_count`` ``(num_envs, 1)`` among them, so that TorchRL's
+    merging by mask restarts exactly the episodes that are reset. A policy must not read them.
 
     Args:
         num_envs: number of episodes run side by side, the batch size.

@@ -98,13 +98,7 @@ class Evaluation:
     def before(
         cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC, quiet: bool = True
     ) -> Evaluation:
-        """Evaluate before learning, when ``mpc`` is the start and what has been learned.
-
-        Unless ``quiet``, a bar shows which closed loop runs.
-
-        Warns:
-            UserWarning: the plant's episodes are not determined by their seeds.
-        """
+        """Evaluate before learning, when ``mpc`` is the start and what has been learned."""
         if isinstance(physics, GymnasiumPlant) and not physics.is_reproducible():
             warnings.warn(UNPAIRED.format(id=physics.id), UserWarning, stacklevel=2)
         policies: dict[str, Callable[[], Policy]] = {"start": lambda: warm_policy(mpc)}
@@ -131,11 +125,7 @@ class Evaluation:
         self.loops[name] = evaluate(self.cfg, policy, self.physics)
 
     def identify(self, data: Callable[[], Sequence[TensorDictBase]]) -> None:
-        """Evaluate the rival `IDENTIFICATION`, if ``cfg.rivals`` chooses it.
-
-        ``data`` returns the logged steps. J is that of the better of `nominal_mpcs`, and nan if
-        they identify no model.
-        """
+        """Evaluate the rival `IDENTIFICATION` of logged steps, if ``cfg.rivals`` chooses it."""
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
             return
@@ -156,9 +146,8 @@ class Evaluation:
     def summary(self) -> dict[str, Any]:
         """Return J of the start, the learned and the true model, the closed gap and the rivals.
 
-        ``J_best`` is that of the learned policy, which is kept, and ``J_final`` that of the last
-        candidate. Costs and gap also with discounted costs. Missing values are nan, as for a plant
-        without a true model. Each cost is a mean over ``episodes``, of at most ``episode_steps``.
+        ``J_best`` is that of the policy that is kept, ``J_final`` that of the last candidate.
+        Missing values are nan.
         """
         loops = {"candidate": self.loops["learned"], **self.loops}
         summary: dict[str, Any] = {}

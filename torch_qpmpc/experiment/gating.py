@@ -93,10 +93,7 @@ class RunGate:
         self.mpc.load_state_dict(mpc.state_dict())
 
     def summary(self) -> dict[str, int]:
-        """Return the numbers of candidates accepted and rejected, and of transitions for them.
-
-        These are ``simulated`` or, with ``gate=plant``, ``alternated``.
-        """
+        """Return the numbers of candidates accepted and rejected, and of transitions for them."""
         if self._gate is None:
             return {}
         decisions = {"accepted": self._gate.accepted, "rejected": self._gate.rejected}

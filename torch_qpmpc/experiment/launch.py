@@ -51,12 +51,8 @@ def settled(
 ) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
     """Decide between a new run in ``folder``, one to resume, and a finished one of a ``sweep``.
 
-    Returns:
-        The run's configuration, the state to resume from or None, and the summary of a finished
-        run or None.
-
-    Raises:
-        QPError: the configuration is invalid, or the folder holds another run.
+    Return the configuration, the state to resume from or None, and a finished run's summary or
+    None; raise `QPError` for an invalid configuration, or if the folder holds another run.
     """
     resume, state = cfg.resume, None
     if resume is None:
@@ -78,10 +74,7 @@ def settled(
 
 
 def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
-    """Raise `QPError` for an unknown key, for which Hydra advises a +, or no run to resume.
-
-    ``configs`` is the folder of the configuration groups.
-    """
+    """Raise `QPError` for an unknown key, for which Hydra advises a +, or no run to resume."""
     known, groups = [*keys()], {path.name for path in Path(configs).iterdir() if path.is_dir()}
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -116,11 +109,7 @@ def launched() -> Iterator[tuple[str, bool]]:
 
 @contextmanager
 def locked(folder: str | Path, elsewhere: str) -> Iterator[None]:
-    """Hold the lock of a run's folder; the operating system releases that of a killed process.
-
-    Raises:
-        QPError: another run holds the lock; the setting ``elsewhere`` chooses another folder.
-    """
+    """Hold the lock of a run's folder, or raise `QPError`; ``elsewhere`` chooses another folder."""
     try:
         with FileLock(Path(folder) / LOCK, timeout=0):
             yield
@@ -168,11 +157,7 @@ class Interrupt:
 
 
 def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
-    """Read the summary of the run in ``folder``; return None if the run has not finished.
-
-    Raises:
-        QPError: the run has finished with other settings than ``cfg``.
-    """
+    """Read the summary of the run in ``folder``; return None if the run has not finished."""
     folder = Path(folder)
     if not (folder / "summary.json").exists():
         return None
@@ -185,10 +170,9 @@ def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
 
 
 def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
-    """The state from which the run in ``folder`` can go on, or None where it has to begin anew.
+    """Return the state from which the run in ``folder`` can go on, or None to begin anew.
 
-    That is where there is none, or one that cannot be read or had other settings. What such a run
-    left for TensorBoard is removed.
+    In that case its files for TensorBoard are removed.
     """
     folder = Path(folder)
     with contextlib.suppress(QPError):

@@ -163,12 +163,7 @@ def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation) -> None:
 
 
 def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:
-    """Measure the distance of the learned constraints from an MPC scheme and the true model.
-
-    Returns:
-        ``canonical_distance`` to the nearest scheme; with a true model also ``model_error``, that
-        scheme's `one_step_error`, and ``model_error_start``, the one of C_0.
-    """
+    """Measure the distance of the learned constraints from an MPC scheme and the true model."""
     if true_model is None:
         return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
     metrics = structure_metrics(mpc, true_model)

@@ -37,7 +37,6 @@ def draw_positions(
     """Draw closed-loop paths from a few starts, and the learned QP's predictions.
 
     They are in the plane of the first two states or outputs, or over time if there is only one.
-    ``names`` are from `episode_names`.
     """
     plane = mpc.n_x > 1
     times = names.get("times", torch.arange(2.0))
@@ -119,10 +118,7 @@ def scale_costs(axes: Axes) -> None:
 
 
 def experience(cfg: DictConfig) -> tuple[float, float, str]:
-    """Return the experience before the first update and that of each update, and its unit.
-
-    It is all that the plant has been run for: the log, the warm-up and the updates.
-    """
+    """Return the experience before the first update, log included, that of each, and its unit."""
     length, unit = find_task(cfg.task).unit
     each = cfg.num_envs * cfg.steps_per_update
     first = each * warm_up_batches(cfg)

@@ -34,12 +34,8 @@ NUMBERS += ("canonical_distance",)
 class RunFolder:
     """The output of one run; a context manager, which flushes at its end.
 
-    Scalars go to metrics.csv and to one of TorchRL's loggers, which a resumed run goes on in. Of
-    that, rows up to the update ``after`` are kept; None begins a new run.
-
-    Raises:
-        QPError: rows of updates up to ``after`` are missing or damaged.
-        OSError: writing failed, here or in a method; no other file is damaged.
+    Scalars go to metrics.csv and to one of TorchRL's loggers. A resumed run keeps the rows up to
+    the update ``after``, None in a new one; `QPError` where some are missing or damaged.
     """
 
     def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
@@ -89,10 +85,7 @@ class RunFolder:
         self.logger.flush()
 
     def finish(self, summary: Mapping[str, Any]) -> None:
-        """Write the outcome to summary.json.
-
-        JSON has no nan (no gap to close) and no inf; both are written as null.
-        """
+        """Write the outcome to summary.json, with null for nan and inf, which JSON lacks."""
         text = json.dumps(_finite(summary), indent=2, allow_nan=False)
         # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
@@ -138,11 +131,7 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
 
 
 def read_summary(folder: str | Path) -> dict[str, Any]:
-    """Read a finished run's summary.json.
-
-    Raises:
-        QPError: the run has not finished, or the file is missing or damaged.
-    """
+    """Read a finished run's summary.json; raise `QPError` if it is missing or damaged."""
     file = Path(folder) / "summary.json"
     if file.with_name(CHECKPOINT).exists() and not file.exists():
         remedy = f"Finish it: {COMMAND} resume={folder}."

@@ -33,8 +33,6 @@ from torch_qpmpc.mpc.state import KIND, stored
 
 #: Files that a run writes before its first checkpoint.
 WRITTEN = ("config.yaml", "metrics.csv")
-#: Keys that may stand beside ``resume``, because they name the run's code.
-NAMING = ("resume", "task", "task.file", "task.id")
 
 
 def snapshot(
@@ -117,14 +115,9 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
     """Load a stopped run's configuration and last state, or None before its first checkpoint.
 
     ``path`` is the run's folder or one of its checkpoints. Beside it, the command line's
-    ``overrides`` name the code that the run needs, as in ``task.file=FILE``.
-
-    Raises:
-        QPError: there is no stopped run, its state is damaged or another run's, its configuration
-            names code that ``overrides`` do not, or there are other overrides.
+    ``overrides`` may only name the code that the run needs, as in ``task.file=FILE``.
     """
     given = {text.partition("=")[0].lstrip("+"): text for text in overrides}
-    _check_alone(given, NAMING)
     cfg, state = _stopped(path)
     code = named_code(cfg.task)
     _check_alone(given, {"resume", *code, *(["task"] if "task.id" in code else [])})

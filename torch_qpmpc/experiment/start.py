@@ -75,9 +75,6 @@ def make_start(
 
     With ``task.start_episodes`` closed loops choose it. The run's folder keeps the log and the
     table of the choice, which are read there if the run has ``written`` them before.
-
-    Raises:
-        QPError: a file cannot be read, the log is not identified, or the plant not explored.
     """
     if cfg.start.name != "data":
         return None

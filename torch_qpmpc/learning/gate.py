@@ -1,9 +1,4 @@
-"""A gate: a learned policy is kept only once closed loops show that it costs less.
-
-A falling TD error does not make a better policy. Learning therefore moves a candidate, and a paired
-comparison of closed loops, with the same starts and disturbances for both, lets it replace the
-policy that is kept, or not.
-"""
+"""A gate: a learned policy is kept only once paired closed loops show that it costs less."""
 
 from __future__ import annotations
 
@@ -201,19 +196,6 @@ class Gate:
     Attributes:
         actor: the policy that is kept.
         accepted, rejected: the numbers of decisions.
-
-    Example:
-        >>> import torch_qpmpc as qm
-        >>> from torch_qpmpc.envs import PointMass
-        >>> from torch_qpmpc.envs.closed_loop import closed_loop
-        >>> physics = PointMass()
-        >>> def costs(mpc, seed):
-        ...     return closed_loop(mpc.policy, physics, steps=20, seed=seed).costs.sum(0)
-        >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
-        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
-        >>> gate = Gate(mpc, costs)
-        >>> gate.judge(mpc).accepted  # an equal policy is no better
-        False
     """
 
     def __init__(

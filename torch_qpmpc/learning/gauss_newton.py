@@ -82,9 +82,8 @@ class GaussNewton(torch.optim.Optimizer):
         damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
             on it. A larger one makes a step less sensitive to its batch's noise.
         td_error_clip: bound on the absolute TD error; none by default.
-        trust_region: solve the batch again after each step and its projection (`QPMPC.project_`),
-            with the targets fixed; undo a step that raised the squared errors, and adapt the
-            damping to the ratio of actual to predicted decrease.
+        trust_region: solve the batch again after each step and its projection; undo a step that
+            raised the squared errors, and adapt the damping to actual over predicted decrease.
         weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:

@@ -53,10 +53,7 @@ FRESH = {"size": 0.0, "signals": None}
 
 
 class Dense:
-    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale * units``.
-
-    Without ``units`` ``(n,)`` they are ones.
-    """
+    """The gradients in one parameter as rows ``(B, n)``, with the metric ``scale * units``."""
 
     def __init__(
         self, leaf: nn.Parameter, group: dict[str, Any], rows: Tensor, units: Tensor | None

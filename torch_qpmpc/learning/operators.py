@@ -1,10 +1,6 @@
 """TensorDict modules that make a QPMPC the critic, value or actor of a TorchRL script.
 
-What V fixes, p, is the entry ``observation``; with a ``preview_key``, it is the preview of known
-signals followed by the observation. Without previews it is the state s.
-
-With ``theta_keys``, entries that an upstream module writes, such as `ThetaNetwork`, are residuals
-of theta, and each QP of the batch has its own.
+p is the entry ``observation`` or, with a ``preview_key``, the preview followed by the observation.
 
 Only here do costs become rewards: TorchRL maximises, so state_value = -V(s) and
 state_action_value = -Q(s, a), both with TorchRL's trailing dimension of one.
@@ -147,9 +143,8 @@ class QPActorValueOperator(_QPOperator):
             third input, after the action. The observation is then the rest of p. None, the
             default, if there are none, or if the observation contains them.
         theta_keys: the keys of residuals by their names in `QPMPC.coordinates`, such as
-            ``{"q": ("theta", "q")}``: further inputs ``(*batch, ..)``, which an upstream module
-            writes, see `ThetaNetwork` and `QPMPC.quadratic_program`. None, the default, shares
-            theta.
+            ``{"q": ("theta", "q")}``: further inputs ``(*batch, ..)``, which an upstream module,
+            such as `ThetaNetwork`, writes. None, the default, shares theta.
         state_value_key, state_action_value_key: the output keys of the value and the critic.
         active_set_key: the key where the value and the critic write the QP's active set, int8
             ``(*batch, n_g)``, after starting from the one they find there, such as one stored in a
@@ -215,17 +210,7 @@ def preview_key(mpc: QPMPC) -> str | None:
 
 
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
-    """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets.
-
-    Example:
-        >>> import torch_qpmpc as qm
-        >>> from torch_qpmpc.envs import PointMass
-        >>> from torch_qpmpc.envs.closed_loop import closed_loop
-        >>> physics = PointMass()
-        >>> options = {"stage_weight": [1.0] * 4 + [0.1] * 2, "action_bounds": ([-1] * 2, [1] * 2)}
-        >>> mpc = qm.QPMPC.from_model(physics.A, physics.B, 5, **options)
-        >>> loop = closed_loop(warm_policy(mpc), physics, steps=10)
-    """
+    """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets."""
     return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))
 
 

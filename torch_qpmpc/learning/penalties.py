@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import band_distance
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, band_distance
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import ungraded
 
@@ -27,8 +26,8 @@ def _finite(x: float) -> bool:
 class DeviationPenalty(nn.Module):
     """The deviation penalty ``sum |C_mask * (C - C_0)|`` (eq:sdp2).
 
-    Weights (c_1, c_2, c_3) of (1, 1, 1) hold C at C_0; those of (0, 0, 0) free it. With c_3 = 0
-    everything below the band is free: the prediction stays causal, but need not be Markovian.
+    With c_3 = 0 everything below the band is free: the prediction stays causal, but need not be
+    Markovian.
 
     Args:
         C_0: the banded matrix, ``(N n_x, n_z)``.
@@ -99,10 +98,8 @@ class DeviationPenalty(nn.Module):
     def proximal_step_(self, C: Tensor, scale: float = 1.0) -> None:
         """Soft-threshold C towards C_0, in place: the minimiser of eq:sdp2 in Delta theta.
 
-        After an optimiser's step to C it solves
-        ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|``. Unlike a subgradient step it reaches
-        C_0 exactly. After a step of SGD it solves the paper's program. It ignores the metrics of
-        Adam and Gauss-Newton: in Adam's, an entry with a smaller step has a smaller threshold.
+        It solves ``min_X 1/2 |X - C|^2 + scale |C_mask * (X - C_0)|`` and, after a step of SGD, the
+        paper's program; it ignores the metrics of Adam and Gauss-Newton.
 
         Args:
             C: the parameter, ``(N n_x, n_z)``.

@@ -35,21 +35,17 @@ class QPQLearningLoss(LossModule):
     Truncation bootstraps, termination does not.
 
     Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
-    estimator, of slices ``(*batch, n)`` have returns of several steps. Their rewards come from
-    the actions taken, so that Q(s, a) then learns the cost of the exploring policy's next steps.
+    estimator, of slices ``(*batch, n)`` have returns of several steps.
 
     If `observe` sees all transitions, V(s+) is clipped to what a constant cost, the least or
-    the largest so far, or none would cost for ever (truncated fitted value iteration: Munos and
-    Szepesvari, "Finite-time bounds for fitted value iteration", JMLR 2008). Without it a transition
-    to a state that no other transition leaves can raise its own target without bound.
+    the largest so far, or none would cost for ever (Munos and Szepesvari, "Finite-time bounds for
+    fitted value iteration", JMLR 2008): else a transition to a state that no other transition
+    leaves can raise its own target without bound.
 
     Samples whose QP has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to
-    the loss or its gradient and are counted in ``unsolved``. So are, in ``invalid_reward`` and with
-    a `RuntimeWarning`, those with a NaN or infinite reward in their return.
-
-    The discount factor is set as for any TorchRL loss, by ``make_value_estimator(gamma=0.9)``; its
-    default is TorchRL's 0.99, independent of the QP's gamma. The sign of the rewards is not
-    checked: pass -L, not L.
+    the loss and are counted in ``unsolved``; those with a NaN or infinite reward, in
+    ``invalid_reward``, with a `RuntimeWarning`. The sign of the rewards is not checked: pass -L.
+    ``gamma`` belongs to `make_value_estimator`, as for any TorchRL loss.
 
     Args:
         value_network: the critic to learn: a `QPActorValueOperator`, or a TensorDictSequential that
@@ -303,12 +299,7 @@ class QPQLearningLoss(LossModule):
 
     @torch.no_grad()
     def observe(self, tensordict: TensorDictBase) -> None:
-        """Extend the range of rewards, which bounds V(s+), by new transitions.
-
-        Args:
-            tensordict: the transitions, of any batch shape. Rewards that are not finite do not
-                count.
-        """
+        """Extend the range of rewards, which bounds V(s+), by those of ``tensordict``."""
         reward = tensordict.get(("next", self.tensor_keys.reward)).to(self.reward_range)
         if (reward := reward[reward.isfinite()]).numel():
             self.reward_range[0] = reward.min().minimum(self.reward_range[0])
@@ -318,11 +309,9 @@ class QPQLearningLoss(LossModule):
     def centre_(self, tensordict: TensorDictBase) -> float:
         """Move the QP's constant c to where the mean TD error of a batch is zero.
 
-        A target network's c moves as far, and the policy does not depend on c, which moves even if
-        it is not learned. This is LSTD in c alone (Bradtke and Barto, "Linear least-squares
-        algorithms for temporal difference learning", Machine Learning 1996): gradient steps need
-        about 1 / (1 - gamma) updates to correct the constant of a start, and until then all other
-        parts learn the difference.
+        A target network's c moves as far, and c moves even if it is not learned. This is LSTD in c
+        alone (Bradtke and Barto, "Linear least-squares algorithms for temporal difference
+        learning", Machine Learning 1996): gradient steps need about 1 / (1 - gamma) updates.
 
         Args:
             tensordict: transitions, as for `forward`. Those without a solution or a finite reward

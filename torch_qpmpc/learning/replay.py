@@ -1,9 +1,8 @@
 """Replay of transitions (TD loss) and of windows tau (SI penalty, eq:sdp3) from one storage.
 
 The storage is two-dimensional, time by environment. A collector's ``[num_envs, T]`` batch adds T
-rows, so that neighbouring rows of a column are neighbouring steps of one environment, however small
-T is. (In a flat storage the environments interleave, and no window fits into T < N steps.) No
-window crosses a change of its column's trajectory id, or the ring buffer's seam.
+rows, so that neighbouring rows of a column are neighbouring steps of one environment. No window
+crosses a change of its column's trajectory id, or the ring buffer's seam.
 """
 
 from __future__ import annotations
@@ -32,17 +31,10 @@ ACTIVE_SETS = (ACTIVE_SET, ("next", ACTIVE_SET))
 
 
 def windows_to_tau(windows: TensorDictBase, preview_key: NestedKey | None = None) -> Tensor:
-    """Return tau = [p_j, a_j, s_{j+1}, a_{j+1}, ..., s_{j+N}] of eq:sdp3, in the order of z.
+    """Return tau = [p_j, a_j, s_{j+1}, .., s_{j+N}] of eq:sdp3, ``(M, n_p + N (n_x + n_u))``.
 
-    p_j is what V fixes at step j: the state s_j or, in general, the preview and the observation.
-
-    Args:
-        windows: ``(M, N)`` consecutive transitions along the last dimension, with
-            ``observation`` ``(M, N, n)``, ``action`` and ``("next", "observation")``.
-        preview_key: the key of the preview; None, the default, if p is the observation.
-
-    Returns:
-        ``(M, n_p + N (n_x + n_u))``.
+    ``windows`` are ``(M, N)`` consecutive transitions along the last dimension. With a
+    ``preview_key``, p is the preview and the observation.
     """
     known = ["observation"] if preview_key is None else [preview_key, "observation"]
     p = [windows[key][..., 0, :] for key in known]

@@ -55,8 +55,7 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
 def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
     """Return detached scalars that describe a batch of values and their targets, ``(*batch,)``.
 
-    Entries that are not finite are left out and counted: NaN targets as invalid rewards, the others
-    as QPs without a solution.
+    NaN targets are left out and counted as invalid rewards, others that are not finite as unsolved.
     """
     use = prediction.isfinite() & target.isfinite()
     invalid = target.isnan()

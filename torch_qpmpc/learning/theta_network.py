@@ -22,9 +22,8 @@ from torch_qpmpc.mpc.parameters import check_names
 class ThetaNetwork(TensorDictModuleBase):
     """A network from p to residuals of theta, an upstream module for ``theta_keys``.
 
-    Each residual is ``size * tanh(..)``, which bounds it. The last layer starts at zero, so that
-    the QP is first the one of ``mpc`` alone. The parameters are float32; inputs may be of any float
-    dtype.
+    Each residual is ``size * tanh(..)``. The last layer starts at zero, so that the QP is first the
+    one of ``mpc`` alone.
 
     Args:
         mpc: the QPMPC; only the shapes of its coordinates are used.

@@ -24,9 +24,8 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.identification import check_excitation
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, banded_matrix
 from torch_qpmpc.mpc.log import Trajectory, as_log, folds
 from torch_qpmpc.mpc.parameters import for_each
 from torch_qpmpc.mpc.ridge import ridge

@@ -94,16 +94,13 @@ class Layout:
     def rows(self, x: Tensor, u: Tensor, D: Tensor, D_f: Tensor) -> Tensor:
         """Arrange values of the rows of G ``(n_g,)``.
 
-        The values belong to x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)`` and D^f as
-        ``D_f`` ``(n_terminal,)``; a leading N + 1 or N may be 1, for the same values in all stages.
+        They are those of x ``(N + 1, n_x)``, u ``(N + 1, n_u)``, D ``(N, n_mixed)`` and D^f as
+        ``D_f`` ``(n_terminal,)``; a leading 1 is for all stages.
         """
         return torch.cat((self.stages(x, u), D.expand(self.horizon, -1).flatten(), D_f))
 
     def discounts(self, gamma: float) -> tuple[Tensor, Tensor]:
-        """Return gamma^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``.
-
-        ``gamma`` is the discount.
-        """
+        """Return ``gamma``^k for the entries of z ``(n_z,)`` and for the rows of G ``(n_g,)``."""
         powers = gamma ** torch.arange(self.horizon + 1, dtype=torch.float64).unsqueeze(-1)
         d, x, u = (powers.expand(-1, size) for size in (self.n_d, self.n_x, self.n_u))
         D, D_f = (powers.expand(-1, size) for size in (self.n_mixed, self.n_terminal))
@@ -112,8 +109,7 @@ class Layout:
     def ties(self, part: str) -> Tensor:
         """Return the index of the value of each entry of a tied ``part``, q, b, lb, ub or w.
 
-        x_N has values of its own in q and w, as w^f in eq:v1c0, but not in lb and ub; d_N has them
-        in q.
+        x_N has values of its own in q and w, as w^f in eq:v1c0, and d_N in q.
         """
         n_x, n = self.n_x, self.n
         x, u = torch.arange(n_x), torch.arange(n_x, n)
@@ -180,7 +176,7 @@ class Layout:
         return (actions[1:] - actions[:-1])[self.held_stages[1:]].flatten(0, 1)
 
     def repeated(self, of_actions: Tensor) -> Tensor:
-        """Return True at the rows of G that bound the actions of held stages, ``(n_g,)``.
+        """Return True at the rows of G that bound the actions of repeated stages, ``(n_g,)``.
 
         ``of_actions`` ``(n_mixed,)`` is True for the rows of D that bound actions alone.
         """
@@ -190,10 +186,10 @@ class Layout:
         return self.rows(none, u, held & of_actions, D_f)
 
     def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` (eq:qpH) from blocks of the stages and of x_N, or from a full H.
+        """Return H ``(n_z, n_z)`` (eq:qpH) from the ``blocks`` of a ``kind`` of hessian.
 
-        The ``blocks`` of the ``kind`` "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H
-        has entries for the plan only. ``discount`` has an entry for each of z.
+        Those of the kind "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H has entries
+        for the plan only. ``discount`` has an entry for each of z.
         """
         H = blocks[0]
         if kind == "diagonal":
@@ -207,10 +203,7 @@ class Layout:
         return root.unsqueeze(-1) * H * root
 
     def block_hessian(self, stage: Tensor, terminal: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` without discounts.
-
-        Its blocks are ``stage`` of (d_k, x_k, u_k), one or N, and ``terminal`` of (d_N, x_N).
-        """
+        """Return H without discounts: ``stage`` of (d_k, x_k, u_k), one or N, and ``terminal``."""
         n_d, size = self.n_d, self.n_d + self.n
         blocks = (*stage.expand(self.horizon, size, size), terminal)
         plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
@@ -233,3 +226,54 @@ def read_blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:
         remedy = "The last one may hold its actions to the end."
         raise QPError.expected("blocks", repr(blocks), want, remedy)
     return (*sizes,)
+
+
+def banded_matrix(A: Tensor, B: Tensor, horizon: int, E: Tensor | None = None) -> Tensor:
+    """Return C_0 ``(N n_x, n_z)`` of the model ``x_{k+1} = A x_k + B u_k + E d_k``.
+
+    A ``(n_x, n_x)``, B ``(n_x, n_u)`` and, with a preview, E ``(n_x, n_d)`` have a leading N if
+    they vary over the ``horizon``. Row block k has (d_k, x_k, u_k, x_{k+1}), the band.
+    """
+    E = A.new_zeros(*A.shape[:-1], 0) if E is None else E
+    n_x = A.shape[-2] if A.ndim > 1 else len(A)
+    n_u, n_d = max(B.shape[-1], 1), E.shape[-1]
+    shapes = {"A": (A, (n_x, n_x)), "B": (B, (n_x, n_u)), "E": (E, (n_x, n_d))}
+    for name, (matrix, shape) in shapes.items():
+        if tuple(matrix.shape) not in (shape, (horizon, *shape)):
+            got = f"shape {tuple(matrix.shape)}"
+            raise QPError.expected(name, got, f"shape {shape} or {(horizon, *shape)}")
+    following = torch.diag_embed(-A.new_ones(horizon, n_x))
+    parts = (*(x.expand(horizon, n_x, -1) for x in (A, B)), following)
+    C = _staircase(torch.cat(parts, dim=-1), n_x + n_u)
+    preview = F.pad(torch.block_diag(*E.expand(horizon, n_x, n_d)), (0, n_d))
+    return torch.cat((preview, C), dim=-1)
+
+
+def model_of(C: Tensor, layout: Layout) -> tuple[Tensor, ...]:
+    """Return A and B and, with a preview, E from the band of C, each with a leading N."""
+    E, A, B = layout.stage_blocks(C).split((layout.n_d, layout.n_x, layout.n_u), dim=-1)
+    return (A, B, E) if layout.n_d else (A, B)
+
+
+def _staircase(blocks: Tensor, step: int) -> Tensor:
+    """Return rows with ``blocks`` ``(N, i, width)``, each ``step`` columns after the one above."""
+    N, width = len(blocks), blocks.shape[-1]
+    total = (N - 1) * step + width
+    # Padded to total + step columns and read with a stride of total, each block moves by step.
+    padded = F.pad(blocks.movedim(1, 0), (0, total + step - width)).flatten(1)
+    rows = padded[:, : N * total].unflatten(-1, (N, total))
+    return rows.movedim(0, 1).flatten(0, 1)
+
+
+def band_distance(layout: Layout) -> Tensor:
+    """Return the signed distance from the band in stages, ``(N n_x, n_z)``, > 0 above it."""
+    n_x, n, horizon = layout.n_x, layout.n, layout.horizon
+    row = torch.arange(horizon).repeat_interleave(n_x).unsqueeze(1)
+    column = torch.arange(horizon * n + n_x)
+    stage = column // n
+    is_state = column % n < n_x
+    # x_{k+1} is on the band of row block k, u_{k+1} the first block above it.
+    above = (stage - row - is_state.long()).clamp(min=0)
+    below = (row - stage).clamp(min=0)
+    preview = torch.arange(horizon + 1).repeat_interleave(layout.n_d) - row
+    return torch.cat((preview, above - below), dim=-1)

@@ -205,10 +205,7 @@ def as_log(data: Any, n_x: int | None = None, n_d: int | None = None) -> Log:
 
 
 def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
-    """Cut all steps into ``count`` consecutive parts of nearly equal length, for cross-validation.
-
-    A trajectory that lies in several parts is cut.
-    """
+    """Cut all steps into ``count`` consecutive parts of nearly equal length."""
     total = sum(trajectory.steps for trajectory in trajectories)
     bounds = [total * i // count for i in range(count + 1)]
     parts: list[list[Trajectory]] = [[] for _ in range(count)]

@@ -1,8 +1,6 @@
 """QPMPC: the module that holds theta and computes V, Q and the policy (eq:qp4, eq:qp5).
 
-It is a generic QP whose constraint matrix C starts from a linear MPC scheme (eq:cband), and becomes
-free or stays a scheme (eq:v1, eq:q1). All values are costs to go, as in the paper; rewards
-appear only in `torch_qpmpc.learning`.
+All values are costs to go, as in the paper; rewards appear only in `torch_qpmpc.learning`.
 """
 
 from __future__ import annotations
@@ -30,8 +28,8 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
-from torch_qpmpc.mpc.rewards import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, Scheme, check_names
+from torch_qpmpc.mpc.stage_cost import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.state import KIND, check_identity, check_own, encoded, identity, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
@@ -72,18 +70,14 @@ class QPMPC(nn.Module):
     x_N, discounted by gamma^N. Parameters and buffers are float64, inputs of any float dtype;
     outputs have the dtype of the input.
 
-    More than x_0 may be known ahead of time: signals such as prices, forecasts and references, the
-    *preview* d_0, .., d_N (``n_d`` entries each). They come first in z,
-
-        z = [d_0, .., d_N, x_0,  u_0, x_1, .., x_N],
-
-    V fixes its first n_p entries p, up to x_0, and Q fixes p and u_0. All s below are p.
+    Signals that are known ahead of time, such as prices, forecasts and references, are the
+    *preview* d_0, .., d_N (``n_d`` entries each), z = [d_0, .., d_N, x_0,  u_0, x_1, .., x_N]. V
+    fixes the first n_p entries p, up to x_0, and Q fixes p and u_0. All s below are p.
 
     Args:
         scheme: the sizes, the model, the cost, the bounds and the discount.
         learn: the parameters among H, H_f, q, c, C, b, G, lb, ub, w; the others are buffers. In a
-            mapping, ``{"H": True, "C": mask}``, a mask of the part's shape is True at the entries
-            that are learned, for example at all but the rows of a constant reference.
+            mapping, ``{"H": True, "C": mask}``, a mask is True at the entries that are learned.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
             (eq:qp5). ``"tied"``: a linear MPC scheme (eq:q1), with one A, B, D and one entry
             of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
@@ -94,9 +88,8 @@ class QPMPC(nn.Module):
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
         schedule: a model, as of `identify_blended`, or its arguments, whose linearisation at s
-            takes the place of the scheme's model in V, Q and the policy. The differences of its
-            C(s) and b(s) from the scheme's are added to theta's, so what is learned is added to the
-            schedule.
+            takes the place of the scheme's model: the differences of its C(s) and b(s) from the
+            scheme's are added to theta's.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -197,8 +190,7 @@ class QPMPC(nn.Module):
     def of(cls, n_x: int, n_u: int, horizon: int, n_d: int = 0, **options: Any) -> Self:
         """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
 
-        A random start is one to learn from: a `UserWarning` says so when the policy first acts
-        before a state_dict is loaded.
+        A `UserWarning` tells of a random start when the policy first acts.
 
         Args:
             n_x, n_u, horizon, n_d: see `Layout`.
@@ -240,11 +232,9 @@ class QPMPC(nn.Module):
         """Return a QPMPC whose model is fitted to logged trajectories, with the outputs as state.
 
         For a state that the outputs show in part, `identify` a model: its ``arguments`` are those
-        of `of`, and a `torch_qpmpc.envs.KalmanFilter` estimates the state.
-
-        Without ``stage_weight`` the cost is fitted to the rewards of the log
-        (`torch_qpmpc.mpc.stage_cost`), with a warning if it explains them poorly. It is dense, as
-        set-points among the observations need it, unless ``hessian="diagonal"`` is passed.
+        of `of`, and a `torch_qpmpc.envs.KalmanFilter` estimates the state. Without ``stage_weight``
+        the cost is fitted to the rewards of the log, with a warning if it explains them poorly. It
+        is dense unless ``hessian="diagonal"`` is passed.
 
         Args:
             trajectories, horizon, n_d, n_x: see `identify`.
@@ -304,8 +294,7 @@ class QPMPC(nn.Module):
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``.
 
-        ``qp`` is the `quadratic_program` of the current theta, if it is available. Errors are as in
-        `solve`.
+        ``qp`` and errors are as in `solve`.
         """
         return self._value(self._checked(s), qp)
 
@@ -392,8 +381,7 @@ class QPMPC(nn.Module):
             s: states ``(*batch, n_x)`` or, with more known, p ``(*batch, n_p)``.
             a: actions ``(*batch, n_u)``.
             warm_start: see `solve_qp`.
-            qp: the `quadratic_program` of the current theta, if it is available, or of the current
-                theta with residuals.
+            qp: the `quadratic_program` of the current theta, if available, or one with residuals.
 
         Raises:
             QPError: an argument is invalid, or (with ``on_failure="raise"``) all unsolved QPs have
@@ -466,16 +454,6 @@ class QPMPC(nn.Module):
 
         Call it after each step of an optimiser; `GaussNewton` does so itself. With
         ``step="cholesky"`` it does nothing.
-
-        Example:
-            >>> import torch, torch_qpmpc as qm
-            >>> mpc = qm.QPMPC.of(2, 1, 3, step="projection", stage_weight=[1.0, 2.0, 0.1])
-            >>> optimizer = torch.optim.SGD(mpc.parameters(), lr=1.0)
-            >>> mpc.H.sum().mul(1.5).backward()
-            >>> optimizer.step()
-            >>> mpc.project_()
-            >>> mpc.H.detach()
-            tensor([0.0000, 0.5000, 0.0000], dtype=torch.float64)
         """
         for name, leaf in self._projected().items():
             dense = self.hessian != "diagonal" and name != "w"
@@ -496,13 +474,6 @@ class QPMPC(nn.Module):
 
         Raises:
             QPError: a residual's name, shape or device is wrong.
-
-        Example:
-            >>> import torch, torch_qpmpc as qm
-            >>> mpc, s = qm.QPMPC.of(2, 1, 5), torch.zeros(8, 2)
-            >>> b = torch.zeros(8, 10)  # residuals of the model's offsets, one per state
-            >>> mpc.value(s, mpc.quadratic_program({"b": b})).shape
-            torch.Size([8])
         """
         with full_precision(self.C_0):
             if residuals is not None:
@@ -521,17 +492,15 @@ class QPMPC(nn.Module):
     def coordinates(self) -> dict[str, Tensor]:
         """Return the unconstrained coordinates of theta, those that residuals move, by name.
 
-        They are the parts, or the tensors that learned parts are computed from: the factors of H,
-        H_f and w, which are coordinates only if learned, the shorter vectors of tied parts, and A,
-        B, E and D, D_f of a tied C and G. H with ``step="projection"`` is its own coordinate.
+        They are the parts, or what learned parts are computed from: factors of H, H_f and w, the
+        shorter vectors of tied parts, and A, B, E and D, D_f of a tied C and G.
         """
         return parameters.coordinates(self)
 
     def save(self, path: str | Path) -> None:
-        """Write this QPMPC to a file of tensors and plain values, which runs no code.
+        """Write this QPMPC atomically to a file of tensors and plain values, which runs no code.
 
-        Its `arguments` and its state_dict are written atomically, to ``path``; a symbolic link
-        there is replaced. Later releases read the file.
+        A symbolic link at ``path`` is replaced. Later releases read the file.
 
         Raises:
             QPError: a part has a parametrization that is not QPMPC's own.
@@ -543,8 +512,6 @@ class QPMPC(nn.Module):
     @classmethod
     def load(cls, path: str | Path) -> QPMPC:
         """Return the QPMPC that `save` wrote to ``path``, on the CPU, with all of theta.
-
-        ``best.pt`` of a run's folder is such a file, if the policy is a QP.
 
         Example:
             >>> import tempfile, torch_qpmpc as qm
@@ -571,8 +538,7 @@ class QPMPC(nn.Module):
 
         Args:
             rates: learning rates by part (``"H"``, ``"C"``, ..), and for other parts by family,
-                ``"cost"`` (H, H_f, q, c, w) and ``"constraints"`` (C, b, G, lb, ub), for which the
-                paper advises different rates.
+                ``"cost"`` (H, H_f, q, c, w) and ``"constraints"`` (C, b, G, lb, ub).
 
         Raises:
             QPError: a learned part has no rate, or a name or a rate is invalid.
@@ -613,17 +579,7 @@ class QPMPC(nn.Module):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `QPMPC.of`, without a subclass's own, as tensors and plain values.
-
-        With the state_dict they are all of its QP, which `save` writes.
-
-        Example:
-            >>> import torch_qpmpc as qm
-            >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
-            >>> twin = qm.QPMPC.of(**mpc.arguments)
-            >>> twin.load_state_dict(mpc.state_dict())
-            <All keys matched successfully>
-        """
+        """The arguments of `QPMPC.of`, without a subclass's own, as tensors and plain values."""
         return self.scheme.arguments | self._options()
 
     def __reduce_ex__(self, protocol: Any) -> tuple:

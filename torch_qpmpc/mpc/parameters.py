@@ -105,7 +105,7 @@ def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
 def groups(
     module: nn.Module, learned: Collection[str], rates: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Return parameter groups for an optimiser, one for each learned part."""
+    """Return `QPMPC.parameter_groups`."""
     if not isinstance(rates, Mapping):
         got = type(rates).__name__
         raise QPError.expected("rates", got, "a mapping such as {'cost': .., 'constraints': ..}")
@@ -128,10 +128,7 @@ def groups(
 
 
 def coordinates(module: nn.Module) -> dict[str, Tensor]:
-    """Return the coordinates of theta by name: A, B, E and D, D_f of tied matrices, else the part.
-
-    H, H_f and w have coordinates only if they are learned.
-    """
+    """Return `QPMPC.coordinates`; H, H_f and w have some only if they are learned."""
     named: dict[str, Tensor] = {}
     for part in parts(module):
         named |= _of_part(module, part)
@@ -144,11 +141,7 @@ def parts(module: nn.Module) -> list[str]:
 
 
 def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the parts of theta with ``residuals`` ``(*batch, ..)`` added to its coordinates.
-
-    Raises:
-        QPError: a name, a shape or a device is wrong.
-    """
+    """Return the parts of theta with ``residuals`` ``(*batch, ..)`` added to its coordinates."""
     check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
     rest = dict(residuals)
     theta = {}
@@ -176,9 +169,9 @@ def check_names(argument: str, names: Collection[str], module: nn.Module) -> Non
 class Leaves:
     """The modules and tensors that a QPMPC's theta follows from, and their content.
 
-    Contents are compared, as versions do not show changes by ``.data``, NumPy or other processes;
-    those of large parts that are not learned, which would take the longest, are not. They are
-    ``known`` if all tensors are plain and none is a plain attribute, as in functional calls.
+    Contents are compared, as versions do not show changes by ``.data``, NumPy or other processes,
+    but not those of large parts that are not learned. They are ``known`` if all tensors are plain
+    and none is a plain attribute, as in functional calls.
     """
 
     def __init__(self, module: Any) -> None:

@@ -1,9 +1,8 @@
 """Parametrizations that keep the sign and structure of theta (`torch.nn.utils.parametrize`).
 
 With H = L L' any gradient step on L leaves H positive semidefinite, so that the update of eq:thup
-needs no semidefinite program (eq:sdp1); if `torch_qpmpc.mpc.projections` projects H instead, it
-stays symmetric. In a linear MPC scheme (eq:v1), C has only a model in its band, and the stages
-share their values.
+needs no semidefinite program (eq:sdp1). In a linear MPC scheme (eq:v1), C has only a model in its
+band, and the stages share their values.
 """
 
 from __future__ import annotations
@@ -12,8 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix, model_of
-from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.layout import Layout, banded_matrix, model_of
 from torch_qpmpc.mpc.projections import CHOLESKY
 
 #: The parts of theta whose sign a convex QP constrains.
@@ -127,14 +125,7 @@ class Cholesky(nn.Module):
         return torch.cat((upper, torch.cat((S, lower @ lower.mT), dim=-1)), dim=-2)
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return a factor of a possibly singular ``value``.
-
-        L comes from a QR factorisation of the symmetric square root, since the usual Cholesky
-        algorithm needs a positive definite matrix.
-
-        Raises:
-            QPError: the block outside of the first ``n_free`` entries is not positive semidefinite.
-        """
+        """Return a factor of a possibly singular ``value``, by QR of its symmetric square root."""
         n = self.n_free
         eigenvalues, vectors = _spectrum(value[..., n:, n:])
         root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)

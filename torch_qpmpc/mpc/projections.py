@@ -4,13 +4,9 @@ The program, with 1/2 |dtheta|^2 for the printed dtheta^2 (whose minimum is half
 
     min over dtheta:  1/2 |dtheta|^2 - alpha g'dtheta   subject to   H(theta + dtheta) >= 0
 
-has as its solution the point with H >= 0 nearest to the optimiser's proposal theta + alpha g. All
-parts of theta but H take the plain step. If |dtheta| is the Frobenius norm of H, the nearest point
-has a closed form: the proposal without its negative eigenvalues, for each block of a block-diagonal
-H; a diagonal H is clipped at zero. So ``"projection"`` and ``"sdp"`` make the same step, for the
-proposal of any optimiser, and ``"cholesky"`` another, in the factor of H, which needs neither. In
-the metrics of Adam and Gauss-Newton the nearest point is another one; `GaussNewton` judges the
-projected step.
+has as its solution the point with H >= 0 nearest to the optimiser's proposal theta + alpha g: the
+proposal without its negative eigenvalues, for each block of H. So ``"projection"`` and ``"sdp"``
+make the same step, and ``"cholesky"`` another, in the factor of H, which needs neither.
 """
 
 from __future__ import annotations
@@ -35,8 +31,8 @@ TOLERANCE, LOOSE = 1e-10, 1e-7
 def nearest_psd(H: Tensor) -> Tensor:
     """Return the positive semidefinite matrices nearest to H ``(*batch, n, n)``, Frobenius norm.
 
-    An asymmetric H is replaced by its symmetric part. Semidefinite matrices stay the same to the
-    last bit. Matrices with NaN or inf stay as well; the solve of the QP rejects them.
+    An asymmetric H is replaced by its symmetric part; semidefinite matrices stay to the last bit,
+    and those with NaN or inf, which the solve of the QP rejects.
 
     Example:
         >>> import torch

@@ -55,10 +55,7 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
     """Return P ``(n_x, n_x)`` of the discounted linear quadratic regulator's cost to go 1/2 x'Px.
 
     Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon. Arguments
-    are as in `lqr_gain`.
-
-    Raises:
-        QPError: the discrete Riccati equation has no stabilising solution.
+    and errors are as in `lqr_gain`.
     """
     n_x, root = A.shape[-1], gamma**0.5
     Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
@@ -101,9 +98,6 @@ def terminal_riccati(A: Tensor, B: Tensor, W: Tensor, gamma: float, layout: Layo
     """Return P for a scheme's model and stage weight, about the x of least stage cost for d.
 
     W is the stage weight, or its diagonal; with a preview, of [d; x; u] or of [x; u].
-
-    Raises:
-        QPError: the scheme has several stages, or there is no solution.
     """
     W, n_d = torch.diag(W) if W.shape == (layout.n,) else W, layout.n_d
     cross = W.new_zeros(layout.n_x, 0)

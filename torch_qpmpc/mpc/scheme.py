@@ -13,10 +13,9 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind, check_number, check_seed
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.banded import banded_matrix
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.layout import SIZES, Layout
+from torch_qpmpc.mpc.layout import SIZES, Layout, banded_matrix
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.qp.tracing import serially_if_forked
 

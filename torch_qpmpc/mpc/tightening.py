@@ -31,16 +31,8 @@ def prediction_covariance(
 ) -> Tensor:
     """Return the covariances of the errors of x_0, .., x_N, ``(N + 1, n_x, n_x)``.
 
-    Args:
-        A: ``(n_x, n_x)``; A + B K with a feedback.
-        W: covariance of the noise, ``(n_x, n_x)``.
-        horizon: N.
-        initial: covariance of the error of x_0, ``(n_x, n_x)``; zero by default.
-
-    Example:
-        >>> one = torch.ones(1, 1)
-        >>> prediction_covariance(one, 0.5 * one, 4).flatten()
-        tensor([0.0000, 0.5000, 1.0000, 1.5000, 2.0000])
+    They grow from ``initial``, zero by default, by ``A``, or A + B K with a feedback, and the
+    covariance ``W`` of the noise, over a ``horizon`` N.
     """
     covariances = [torch.zeros_like(W) if initial is None else initial]
     for _ in range(horizon):

@@ -112,9 +112,8 @@ def ungraded(name: str, value: Any) -> Any:
 def read_numbers(name: str, value: Any, differentiable: bool = False) -> Tensor:
     """Convert to a float64 tensor on the CPU, which may have NaN or inf.
 
-    Raises:
-        QPError: there are no real numbers, or a gradient would be lost: only ``differentiable``
-            arguments may require one.
+    Raise `QPError` where there are no real numbers, or an argument that is not ``differentiable``
+    requires a gradient.
     """
     value = value if differentiable else ungraded(name, value)
     of_scipy = hasattr(value, "toarray")

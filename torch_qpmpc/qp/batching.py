@@ -22,12 +22,9 @@ def broadcast(*shapes: Sequence[int]) -> torch.Size:
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
-    """Move the vmapped dimension of each tensor to the front, and align the batch ranks.
+    """Move the vmapped dimension of each tensor of a vmap rule to the front, and align batch ranks.
 
-    Args:
-        in_dims, args: the arguments of a vmap rule.
-        event_ndims: the number of event dimensions of each tensor; further arguments are returned
-            unchanged.
+    Arguments beyond those with ``event_ndims`` event dimensions are returned unchanged.
     """
     tensors = [
         (i, tensor, dim, n)

@@ -1,10 +1,8 @@
 """`solve_qp`: the certified, differentiable solution of a batch of QPs.
 
-Autograd Functions attach the derivative; `torch_qpmpc.qp.derivatives` has the formulas. *Eager*
-calls run the pipeline and attach one Function. *Traced* calls (`torch.func`, compile, fake tensors,
-forward mode) are one custom operator over the same pipeline, which stays opaque to `torch.compile`,
-fake tensors and `vmap`. The Function around it makes it differentiable under `torch.func` and in
-forward mode, which a custom operator alone is not.
+*Eager* calls run the pipeline and attach one autograd Function. *Traced* calls (`torch.func`,
+compile, fake tensors, forward mode) are one custom operator over the same pipeline, opaque to them,
+and a Function around it that is differentiable under `torch.func` and in forward mode.
 """
 
 from __future__ import annotations

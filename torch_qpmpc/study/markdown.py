@@ -26,11 +26,7 @@ def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 
 
 def replaced(text: str, new: str, marker: str) -> str:
-    """Replace what ``text`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``.
-
-    Raises:
-        QPError: ``text`` does not have one of each, in this order.
-    """
+    """Replace what ``text`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``."""
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     counts = text.count(begin), text.count(end)
     if counts != (1, 1) or text.index(begin) > text.index(end):

@@ -12,7 +12,7 @@ from torch_qpmpc.analysis.plots import draw_matrix
 from torch_qpmpc.analysis.structure import canonical
 from torch_qpmpc.experiment.plots import draw_lines, experience, scale_costs
 from torch_qpmpc.study.runs import CASES, FinishedRun
-from torch_qpmpc.study.statistics import interquartile_mean, spread, spread_name
+from torch_qpmpc.study.statistics import interquartile_mean, spread
 
 TICKS = [0, 0.02, 0.05, 0.1, 0.2, 0.5, 1], ["0", ".02", ".05", ".1", ".2", ".5", "1"]
 
@@ -76,9 +76,8 @@ def learning_figure(frame: pd.DataFrame) -> Figure:
     for axes in right:
         draw_gap(axes, frame)
     seeds = sorted(frame["seed"].unique().tolist())
-    counts = [n for part in (frame, frame.query("real")) for n in part["label"].value_counts()]
     title = f"{frame['noise'].iloc[0]} noise: interquartile mean over seeds {seeds}"
-    figure.suptitle(f"{title}, {spread_name(counts)}")
+    figure.suptitle(f"{title}, 95% interval (range of fewer than six)")
     return figure
 
 
@@ -104,42 +103,21 @@ def constraints_figure(frame: pd.DataFrame) -> Figure:
     return figure
 
 
-def draw_meaning(axes: Axes, frame: pd.DataFrame) -> None:
-    """Draw the error of the model read from C over the error of the corrupted model."""
-    start, learned = frame["prediction_error_start"], frame["prediction_error"]
-    for label, runs in frame.groupby("label", sort=False):
-        colour = [colours(frame)[str(label)]]
-        axes.scatter(start[runs.index], learned[runs.index], c=colour, s=14, label=label)
-    ends = [start.min() * 0.9, start.max() * 1.1]
-    axes.plot(ends, ends, "k--", linewidth=1)
-    axes.set(xlabel="one-step error of the corrupted model", ylabel="... of the model read from C")
-    axes.set(yscale="log")
-
-
 def meaning_figure(frame: pd.DataFrame) -> Figure:
-    """Draw the model errors of the learned C, and the gap left over their ratio."""
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    draw_meaning(left, frame)
-    for label, runs in frame.query("real").groupby("label", sort=False):
-        ratio = runs["prediction_error"] / runs["prediction_error_start"]
-        colour = [colours(frame)[str(label)]]
-        right.scatter(ratio, 1 - runs["closed_gap"], c=colour, s=14, label=label)
-    right.axvline(1, color="k", linestyle="--", linewidth=1)
-    right.set(xlabel="prediction error, learned / corrupted", ylabel="gap left", xscale="log")
-    right.set_yscale("symlog", linthresh=0.01)
-    left.legend(fontsize="small")
-    return figure
-
-
-def readme_figure(frame: pd.DataFrame) -> Figure:
-    """Draw the study in one figure: the gap left under each noise, and the model errors."""
+    """Draw a study in one figure: the gap left under each noise, and the model errors."""
     noises = sorted(frame["noise"].unique(), reverse=True)
     figure = Figure(figsize=(4 * (len(noises) + 1), 3.6), layout="constrained")
     panels = figure.subplots(1, len(noises) + 1)
     for axes, noise in zip(panels, noises, strict=False):
         draw_gap(axes, frame.loc[frame["noise"] == noise])
         axes.set_title(f"{noise} noise")
-    draw_meaning(panels[-1], frame)
+    start, learned = frame["prediction_error_start"], frame["prediction_error"]
+    for label, runs in frame.groupby("label", sort=False):
+        style = {"c": [colours(frame)[str(label)]], "s": 14, "label": label}
+        panels[-1].scatter(start[runs.index], learned[runs.index], **style)
+    ends = [start.min() * 0.9, start.max() * 1.1]
+    panels[-1].plot(ends, ends, "k--", linewidth=1)
+    labels = ("one-step error of the corrupted model", "... of the model read from C")
+    panels[-1].set(xlabel=labels[0], ylabel=labels[1], yscale="log")
     panels[-1].legend(fontsize="small")
     return figure

@@ -117,7 +117,7 @@ def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     page.write_text(replaced(text, "\n\n".join(tables), name), encoding="utf-8")
     _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
     if len({*first["label"]}) <= SIDE_BY_SIDE:
-        plots.readme_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
+        plots.meaning_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
 
 
 def main(arguments: list[str] | None = None) -> None:

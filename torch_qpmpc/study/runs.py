@@ -32,8 +32,8 @@ from torch_qpmpc.experiment.run_folder import NUMBERS, read_metrics, read_summar
 from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.code import has_run
-from torch_qpmpc.mpc.banded import band_distance
 from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The paper's cases, in its order.
@@ -52,11 +52,7 @@ class FinishedRun:
 
     @cached_property
     def cfg(self) -> DictConfig:
-        """The run's configuration.
-
-        Raises:
-            QPError: it does not match this version's configs/.
-        """
+        """The run's configuration; `QPError` if it does not match this version's configs/."""
         cfg = load_config(self.folder / "config.yaml")
         try:
             check_config(cfg)
@@ -109,13 +105,10 @@ class FinishedRun:
         return read_metrics(self.folder)
 
     def readings(self) -> dict[str, float]:
-        """Read zeros and model errors from the learned constraints.
+        """Read the share of zeros above C's band and the errors of learned and first model.
 
-        Returns:
-            ``zeros_above``, the share of C's entries above the band that are exactly zero, and
-            ``prediction_error`` and ``prediction_error_start``, the errors of the learned and the
-            initial `nearest_model`, nan if the constraints do not determine the states or the true
-            model is unknown.
+        The errors are nan if the constraints do not determine the states or the true model is
+        unknown.
         """
         above = band_distance(self.policy.layout) > 0
         zeros = (self.policy.C[above] == 0).double().mean().item()
@@ -152,15 +145,11 @@ def load_run(folder: str | Path) -> FinishedRun:
 
 
 def collect(folder: str | Path) -> pd.DataFrame:
-    """Collect every finished run below ``folder``.
+    """Collect every finished run below ``folder``, a row for each, or raise `QPError`.
 
-    Returns:
-        A row for each run: the entries of summary.json, `FinishedRun.readings`, ``run``, a
-        `FinishedRun`, ``sweep``, the folder that contains the run, ``label``, its case with its
-        ablation or the settings that vary in the sweep, and ``real``, True if the gap is real.
-
-    Raises:
-        QPError: there is no finished run.
+    A row has the entries of summary.json, `FinishedRun.readings`, ``run``, a `FinishedRun`,
+    ``sweep``, the folder that contains the run, ``label``, its case with its ablation or the
+    settings that vary in the sweep, and ``real``, True if the gap is real.
     """
     folder, rows = Path(folder), []
     for file in sorted(folder.rglob("summary.json")):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,22 +28,10 @@ class Spread(NamedTuple):
         return f"(range of {self.count}: {low} to {high})" if self.few else f"[{low}, {high}]"
 
 
-def spread_name(counts: Iterable[int]) -> str:
-    """Return the name of spreads of ``counts`` values each."""
-    few = {count < FEWEST for count in counts}
-    if few == {True}:
-        return "range"
-    return "95% interval" + (" (range of fewer than six)" if True in few else "")
-
-
 def interquartile_mean(x: np.ndarray, axis: int = 0) -> np.ndarray:
     """Compute the mean of the middle half of the n values along ``axis``.
 
     Unless n is a multiple of four, two values are weighted in part.
-
-    Example:
-        >>> float(interquartile_mean(np.array([0.0, 1.0, 3.0, 1000.0])))
-        2.0
     """
     ordered = np.sort(np.moveaxis(x, axis, -1), axis=-1)
     n = ordered.shape[-1]
@@ -56,19 +44,8 @@ def spread(
 ) -> Spread:
     """Compute the 95% bootstrap interval of a statistic of all runs, or the range of few values.
 
-    Each stratum, such as the seeds of one case, is resampled separately, so that every case keeps
-    its number of runs.
-
-    Args:
-        strata: arrays ``(n_i, ...)``; the smallest n_i decides between interval and range.
-        statistic: a function of an array and ``axis``.
-
-    Returns:
-        The ends, each ``(...)``.
-
-    Example:
-        >>> spread([np.array([0.7, 0.9, 0.8])]).text(".1f")
-        '(range of 3: 0.7 to 0.9)'
+    Each of the ``strata`` ``(n_i, ...)``, such as the seeds of one case, is resampled separately;
+    the smallest n_i decides between interval and range. ``statistic`` has an ``axis``.
     """
     sizes, together = [len(stratum) for stratum in strata], np.concatenate(strata)
     if not all(sizes):

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from tests.problems import expanded, known_qp, normal, programs_of, reduced_of, times
 from torch_qpmpc import Status, solve_qp
-from torch_qpmpc.mpc.banded import banded_matrix
+from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.pipeline.arrays import Theta
 from torch_qpmpc.qp.pipeline.condensing import (
     Elimination,

@@ -54,12 +54,7 @@ def has_run(task: Mapping[str, Any]) -> bool:
 
 
 def run_code(task: Mapping[str, Any]) -> None:
-    """Run the script and import the modules that ``task`` names: the command line's own.
-
-    Raises:
-        QPError: the script does not exist, is no Python file, or registers another task; or a file
-            is named beside a built-in task, which would not read it.
-    """
+    """Run the script and import the modules that ``task`` names: the command line's own."""
     name, file = task.get("name"), named_code(task).get("task.file")
     if file is None and task.get("file") is not None and name in TASKS:
         got = f"{task['file']!r} with task={name}, which reads no file"
@@ -77,9 +72,6 @@ def named_task(arguments: Sequence[str]) -> list[str]:
     """Return the command line with ``task=NAME`` of the script in ``task.file=FILE``, which is run.
 
     A command line that names a task or resumes a run is returned unchanged.
-
-    Raises:
-        QPError: the script does not exist, is no Python file, or does not register one task.
     """
     named = {key: value for key, _, value in (x.partition("=") for x in arguments)}
     file = named.get("task.file")

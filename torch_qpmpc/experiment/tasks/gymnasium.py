@@ -69,11 +69,7 @@ REMEDY = (
 
 
 def make_plant(cfg: DictConfig) -> GymnasiumPlant:
-    """Make the environment with its further arguments.
-
-    Raises:
-        QPError: it cannot be made, or needs a module that has not been imported.
-    """
+    """Make the environment with its further arguments, if its module has been imported."""
     if not has_run(cfg.task):
         got = f"{cfg.task.id!r} with task.kwargs={cfg.task.get('kwargs')}"
         expected = "an environment whose module has been imported"
@@ -88,9 +84,6 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
 
     With ``start=data``, those that are null are None. The bounds of the observations count with
     ``task.observation_bounds`` only.
-
-    Raises:
-        QPError: a matrix is missing, or does not have the shape of the environment's spaces.
     """
     n_x, n_u = plant.n_x, len(plant.lb_a)
     shapes = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}

@@ -27,7 +27,6 @@ from torch_qpmpc.mpc.log import as_log, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.projections import nearest_psd
-from torch_qpmpc.mpc.rewards import GOOD, fit_rewards, poor, scheme_cost
 from torch_qpmpc.mpc.riccati import (
     affine_cost_to_go,
     lqr_gain,
@@ -35,7 +34,7 @@ from torch_qpmpc.mpc.riccati import (
     terminal_riccati,
 )
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.stage_cost import StageCost
+from torch_qpmpc.mpc.stage_cost import GOOD, StageCost, fit_rewards, poor, scheme_cost
 from torch_qpmpc.mpc.subspace import fit_state_space
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
@@ -47,13 +46,11 @@ class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
     The observation of ``log`` is the state of ``model``: where the plant is ``observed``, the
-    estimate by its filter; ``order`` is as in `fit_state_space`. ``horizon`` is the QP's. ``cut``
-    is the number of the log's episodes that blow up. ``held`` is an action ``(n_u,)`` that the
-    policy holds, by a cost of its own; None for the policy of the fitted cost. ``choice`` is the
-    table of starts that it was chosen from, if it was. ``blended`` is the QP's schedule, in the
-    place of the model; None without one. ``riccati`` is True if the cost of x_N is the
-    regulator's. ``found`` is the identified model with the outputs of the log. ``print`` shows
-    ``cut``, the model, the fit of the cost, and that table.
+    estimate by its filter; ``order`` is as in `fit_state_space`. ``cut`` is the number of the log's
+    episodes that blow up. ``held`` is an action ``(n_u,)`` that the policy holds, by a cost of its
+    own. ``choice`` is the table of starts that it was chosen from, ``blended`` the QP's schedule.
+    ``riccati`` is True if the cost of x_N is the regulator's. ``found`` is the identified model
+    with the outputs of the log.
     """
 
     log: Any
@@ -162,10 +159,7 @@ def _scheme_model(model: Innovations) -> Model:
 
 
 def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
-    """Return ``cost``, fitted to a log, with the regulator's cost to go at x_N.
-
-    With known signals, that is the cost about the x of least stage cost for them.
-    """
+    """Return ``cost``, fitted to a log, with the regulator's cost to go at x_N."""
     layout, model = start.layout, start.model
     A, B, offset = (torch.tensor(part) for part in (model.A, model.B, model.offset))
     first, fitted = cost.q[: -layout.n_x], start.cost
@@ -223,9 +217,8 @@ def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBa
     """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
 
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a
-    second scheme with the regulator's cost of x_N, if there is one. Each soft bound is tightened by
-    the covariance of the prediction errors, so that it holds with a probability of 95 % with the
-    regulator's feedback, if there is one. ``data`` are logs as in `identify`.
+    second scheme with the regulator's cost of x_N, if there is one. Soft bounds are tightened by
+    the prediction errors' covariance, with the regulator's feedback, if there is one.
     """
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)

@@ -195,10 +195,7 @@ def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:
-    """Find a task by the keys under ``task``; no code runs.
-
-    A task whose script has not run in this process has no plant: see `code.run_code`.
-    """
+    """Find a task by the keys under ``task``; without its script, which does not run, no plant."""
     name, file = settings.get("name"), settings.get("file")
     if name in TASKS:
         return TASKS[name]

@@ -4,9 +4,8 @@ Arrays are NumPy's on the CPU and tensors elsewhere, float64 and contiguous, wit
 are made here, once, and determine the kernels: `torch_qpmpc.qp.kernels.sample` or
 `torch_qpmpc.qp.kernels.sample_torch`.
 
-Training changes theta once per update and solves V, Q and the policy with it. Each thread caches
-its latest thetas by the content of their tensors, so that no in-place update, copied module or
-functional call can make a result stale.
+Each thread caches its latest thetas by the content of their tensors, so that no in-place update,
+copied module or functional call can make a result stale.
 """
 
 from __future__ import annotations
@@ -246,14 +245,9 @@ class Programs:
     ) -> tuple[Programs, torch.Size]:
         """Return the QPs of H, q, c, C, b, G, lb, ub, w, fixed, flattened, and their batch shape.
 
-        QPs that share matrices share one copy, as do those whose matrices are equal. The
-        preparation of a theta that the whole batch shares is cached.
-
-        Args:
-            operands: the tensors, of any batch shapes.
-            n_kept: the number of leading entries of z that the elimination of C z = b keeps; by
-                default those that are fixed.
-            device: the device for tensors; None for NumPy arrays.
+        QPs that share matrices, or have equal ones, share one copy. The preparation of a theta that
+        the whole batch shares is cached. The elimination of C z = b keeps ``n_kept`` leading
+        entries of z, by default the fixed ones. Without a ``device`` there are NumPy arrays.
         """
         *theta, fixed = operands
         n_f = fixed.shape[-1]

@@ -3,10 +3,9 @@
 It takes the QPs that the certificate rejects. For fixed states of the rows (free, held at a bound,
 saturated at |lam| = w) the KKT conditions are linear in z, chi and the multipliers of held rows.
 Iterative refinement with residuals in twice the working precision solves them, without elimination
-of C z = b, to far more digits than the condition number leaves in float64 (Higham, "Accuracy and
-stability of numerical algorithms", chapter 12). Rows that contradict their states change them, and
-the new set is solved. The result is judged before it is rounded: where rows are nearly parallel,
-rounding alone violates them by an amount that matters.
+of C z = b (Higham, "Accuracy and stability of numerical algorithms", chapter 12). Rows that
+contradict their states change them, and the new set is solved. The result is judged before it is
+rounded: where rows are nearly parallel, rounding alone violates them.
 """
 
 from __future__ import annotations

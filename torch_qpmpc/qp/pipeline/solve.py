@@ -112,15 +112,8 @@ _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 def solve_now(*arguments: Any) -> BatchSolution:
     """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
 
-    Args:
-        arguments: H, q, c, C, b, G, lb, ub and w of the `QuadraticProgram`; ``fixed``; the active
-            sets ``(*batch, n_g)`` of a warm start, or None; ``n_kept`` of `Programs.of`; ``solver``
-            and ``on_failure`` of `torch_qpmpc.solve_qp`.
-
-    Raises:
-        QPError: the solver or ``on_failure`` is unknown, the data are invalid, or the batch
-            exceeds the memory.
-        SolverError: with ``on_failure="raise"``, a QP has no certified solution.
+    The ``arguments`` are H, q, c, C, b, G, lb, ub, w and ``fixed``; the active sets ``(*batch,
+    n_g)`` of a warm start, or None; ``n_kept`` of `Programs.of`; ``solver`` and ``on_failure``.
     """
     *theta, fixed, start, n_kept, solver, on_failure = arguments
     q = theta[1]
