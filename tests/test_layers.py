@@ -70,7 +70,7 @@ BUDGET = {
     "envs": 1457,
     "experiment": 3350,
     "export": 1445,
-    "learning": 2715,
+    "learning": 2770,
     "mpc": 5118,
     "proofs": 1003,
     "qp": 5915,

@@ -177,3 +177,14 @@ def test_the_si_penalty_as_a_quadratic_in_C():
     for offset in (b, None):
         D = torch.cat((C, (b if offset is not None else 0 * b).unsqueeze(-1)), -1)
         assert_close(0.5 * ((D @ S) * D).sum(), penalty(C, windows, offset))
+
+
+def test_of_pairs_of_windows_the_difference_of_errors_counts(generator):
+    C, b = normal(generator, 3, 8), normal(generator, 3)
+    pairs, penalty = normal(generator, 5, 2, 8), SystemIdentificationPenalty(0.3)
+    expected = penalty(C, pairs[:, 1] - pairs[:, 0])
+    assert_close(penalty(C, pairs, b), expected)
+    D = torch.cat((C, b[:, None]), -1)
+    assert_close(0.5 * ((D @ penalty.curvature(pairs)) * D).sum(), expected)
+    level = normal(generator, 3)  # which no difference sees
+    assert_close(penalty(C, pairs, b + level), expected)

@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 from tests import store
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.learning.replay import Replay, windows_to_tau
+from torch_qpmpc.learning.replay import Replay, walk, windows_to_tau
 
 ENVS, N = 8, 4
 
@@ -198,3 +198,46 @@ def test_a_flattened_batch_is_an_error():
 def test_bad_capacity_is_an_error(capacity):
     with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):
         Replay(capacity, ENVS, 32, N, 5)
+
+
+def noisy(kind: str, seed: int, max_steps: int = 30, count: int = 40) -> TensorDictBase:
+    """Return random steps of ``ENVS`` episodes in turn, with an exactly known constant state."""
+    env = PointMassEnv(ENVS, PointMass(noise_kind=kind), max_steps=max_steps, seed=seed)
+    torch.manual_seed(seed)
+    steps = env.rollout(count, break_when_any_done=False)
+    for key in ("observation", ("next", "observation")):
+        steps[key] = torch.nn.functional.pad(steps[key], (0, 1), value=3.0)
+    return steps
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_random_walk_is_told_from_white_noise_in_any_unit(seed, unit):
+    for kind, walks in (("brownian", True), ("gaussian", False)):
+        steps = noisy(kind, seed)
+        for key in ("observation", ("next", "observation")):
+            steps[key] = steps[key].double() * torch.tensor([unit, 1, 1, 1 / unit, 1]).double()
+        size = walk(steps)  # a walk of 30 steps; a fifth state has none
+        assert size == pytest.approx(15 ** (0.5 * 4 / 5), rel=0.4) if walks else size == 0
+
+
+def test_steps_without_noise_or_neighbours_are_no_walk():
+    assert not walk(noisy("brownian", 0)[:, :1])
+    assert not walk(noisy("brownian", 0)[:1, :8])
+    exact = PointMassEnv(ENVS, PointMass(noise_std=0.0), max_steps=30, seed=0)
+    assert not walk(exact.rollout(40, break_when_any_done=False))
+
+
+def test_windows_of_a_random_walk_are_pairs_whose_errors_differ_by_its_steps():
+    data, physics = noisy("brownian", 1), PointMass(noise_kind="brownian")
+    ids = (torch.arange(40) // 30 + 2 * torch.arange(ENVS)[:, None]).expand(ENVS, 40)
+    for key in ("observation", ("next", "observation")):
+        data[key] = data[key][..., :4]
+    data["collector", "traj_ids"] = ids
+    tau, size = filled([data], rows=40).sample_tau().double(), walk(data)
+    assert size > 2
+    assert tau.shape == (400, 2, N * 6 + 4)
+    s, a, after = tau[..., :4], tau[..., 4:6], tau[..., 6:10]
+    steps = (after - s @ physics.A.T - a @ physics.B.T).diff(dim=1)
+    assert steps.std().item() == pytest.approx(0.002 * size, rel=0.1)
+    torch.testing.assert_close(tau[:, 0, 6:], tau[:, 1, :-6])

@@ -124,7 +124,8 @@ class SystemIdentificationPenalty(nn.Module):
     """The system-identification (SI) penalty ``beta sum_i ||C tau_i - b||^2`` (eq:sdp3).
 
     C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
-    lowers the penalty.
+    lowers the penalty. Of pairs of windows it takes the difference of their errors, which is white
+    if the noise is a random walk.
 
     Args:
         beta: weight of the penalty.
@@ -147,24 +148,35 @@ class SystemIdentificationPenalty(nn.Module):
         self.beta = beta
 
     def curvature(self, windows: Tensor) -> Tensor:
-        """Return S ``(n_z + 1, n_z + 1)``: the penalty on windows ``(M, n_z)`` as a quadratic.
+        """Return S ``(n_z + 1, n_z + 1)``: the penalty as a quadratic ``1/2 tr(D S D')``.
 
-        It is ``1/2 tr(D S D')``, with D = [C, b].
+        D is [C, b], for windows ``(M, n_z)``, or pairs ``(M, 2, n_z)``.
         """
-        check_tensor("windows", windows, "M", "n_z", batched=False, remedy=WINDOWS_REMEDY)
-        tau = F.pad(windows.to(torch.float64), (0, 1), value=-1.0)
+        _check_windows(windows, "n_z")
+        tau = _single(F.pad(windows.to(torch.float64), (0, 1), value=-1.0))
         return 2 * self.beta * tau.mT @ tau
 
     def forward(self, C: Tensor, windows: Tensor, b: Tensor | None = None) -> Tensor:
-        """Return the penalty of C ``(n_c, n_z)`` and b on windows ``(M, n_z)``, a scalar.
+        """Return the penalty of C ``(n_c, n_z)`` and b on windows, a scalar.
 
         Args:
             C: ``(n_c, n_z)``.
-            windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}]. With a preview, s_j is p at step j.
+            windows: tau_i = [s_j, a_j, s_{j+1}, .., s_{j+N}], ``(M, n_z)``, or pairs of neighbours
+                tau_i, tau_{i+1}, ``(M, 2, n_z)``. With a preview, s_j is p at step j.
             b: ``(n_c,)``; None for zero.
         """
         check_tensor("C", C, "n_c", "n_z", batched=False, remedy="Pass mpc.C.")
-        check_tensor("windows", windows, "M", C.shape[-1], batched=False, remedy=WINDOWS_REMEDY)
+        _check_windows(windows, C.shape[-1])
         b = C.new_zeros(len(C)) if b is None else b
         check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
-        return self.beta * (windows.to(C.dtype) @ C.mT - b).square().sum()
+        return self.beta * _single(windows.to(C.dtype) @ C.mT - b).square().sum()
+
+
+def _check_windows(windows: Tensor, n_z: int | str) -> None:
+    pairs = (2,) if isinstance(windows, Tensor) and windows.ndim == 3 else ()
+    check_tensor("windows", windows, "M", *pairs, n_z, batched=False, remedy=WINDOWS_REMEDY)
+
+
+def _single(rows: Tensor) -> Tensor:
+    """Return rows ``(M, n)``, and the differences of pairs of rows ``(M, 2, n)``."""
+    return rows if rows.ndim == 2 else rows[:, 1] - rows[:, 0]

@@ -23,6 +23,7 @@ from torchrl.data import (
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.subspace import EXACT
 from torch_qpmpc.qp.program import UNKNOWN
 
 #: The keys of a transition's active sets: of Q(s, a), and of V(s+).
@@ -40,6 +41,34 @@ def windows_to_tau(windows: TensorDictBase, preview_key: NestedKey | None = None
     p = [windows[key][..., 0, :] for key in known]
     pairs = torch.cat([windows["action"], windows["next", "observation"]], dim=-1)
     return torch.cat([*p, pairs.flatten(-2)], dim=-1)
+
+
+def walk(steps: TensorDictBase, preview_key: NestedKey | None = None) -> float:
+    """Return the size of the noise relative to its steps if it is a random walk, else zero.
+
+    Least squares fit a linear model of the next states, and one of their changes, to consecutive
+    steps ``(count, T)``. Changes of white noise have twice its variance; those of a walk are white.
+    So the noise is a walk if the model of changes leaves less than half of the variance, in the
+    geometric mean over the states. A variance below `EXACT` of a state's is none.
+    """
+    known = ["observation"] if preview_key is None else [preview_key, "observation"]
+    x = torch.cat([steps[key].double() for key in (*known, "action")], -1)
+    s, y = steps["observation"].double(), steps["next", "observation"].double()
+    follows = (y[:, :-1] == s[:, 1:]).all(-1)  # neither an end nor the ring's seam is between
+    changes = x.diff(dim=1)[follows], y.diff(dim=1)[follows]
+    x, y = x[:, 1:][follows], y[:, 1:][follows]
+    if len(y) < 2 * (x.shape[-1] + 1):
+        return 0.0
+    x, y = x - x.mean(0), y - y.mean(0)
+    least = (EXACT * y.square().mean(0)).clamp(min=torch.finfo(torch.float64).tiny)
+
+    def variances(x: Tensor, y: Tensor) -> Tensor:
+        x = torch.nan_to_num(x / x.square().mean(0).sqrt())  # constant signals explain nothing
+        rest = y - x @ torch.linalg.lstsq(x, y, driver="gelsd").solution
+        return rest.square().mean(0).maximum(least)
+
+    ratio = (variances(x, y) / variances(*changes)).log().mean().exp().item()
+    return ratio**0.5 if ratio > 2 else 0.0
 
 
 class Replay:
@@ -90,15 +119,19 @@ class Replay:
         options: dict[str, Any] = {"storage": storage, "generator": self.generator}
         # ReplayBuffer, not TensorDictReplayBuffer: that one fails on batches with T = 1.
         self.transitions = ReplayBuffer(sampler=RandomSampler(), batch_size=batch_size, **options)
-        sampler = SliceSampler(
-            slice_len=window,
-            traj_key=("collector", "traj_ids"),
-            truncated_key=None,  # a key would mark each window's last step as truncated
-            init_key=None,
-            strict_length=True,
-        )
-        options |= {"sampler": sampler, "writer": ImmutableDatasetWriter()}
-        self.windows = ReplayBuffer(batch_size=num_windows * window, **options)
+
+        def windows(steps: int) -> ReplayBuffer:
+            sampler = SliceSampler(
+                slice_len=steps,
+                traj_key=("collector", "traj_ids"),
+                truncated_key=None,  # a key would mark each window's last step as truncated
+                init_key=None,
+                strict_length=True,
+            )
+            own = {"sampler": sampler, "writer": ImmutableDatasetWriter()}
+            return ReplayBuffer(batch_size=num_windows * steps, **{**options, **own})
+
+        self.windows, self._longer = windows(window), windows(window + 1)
 
     def __len__(self) -> int:
         return len(self.transitions)
@@ -149,8 +182,18 @@ class Replay:
         return stored.transpose(0, 1)
 
     def sample_tau(self) -> Tensor:
-        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see `windows_to_tau`."""
-        return windows_to_tau(self.windows.sample().reshape(-1, self.window), self.preview_key)
+        """Sample windows ``(num_windows, n_p + N (n_x + n_u))``; see `windows_to_tau`.
+
+        If the noise is a `walk`, they are pairs of neighbours, ``(num_windows, 2, ..)``, in a unit
+        in which the differences of their errors, its steps, are of the noise's own size.
+        """
+        key = self.preview_key
+        size = walk(self.steps(), key) if self._longer.can_sample() else 0.0
+        if not size:
+            return windows_to_tau(self.windows.sample().reshape(-1, self.window), key)
+        longer = self._longer.sample().reshape(-1, self.window + 1)
+        pairs = (longer[:, :-1], longer[:, 1:])
+        return size * torch.stack([windows_to_tau(x, key) for x in pairs], 1)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored data (not copied: save them at once), write position and generator."""
