@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.signal
+import torch
 
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import Log
+from torch_qpmpc.mpc.log import Log, Trajectory
 from torch_qpmpc.mpc.subspace import Fit
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
@@ -62,7 +63,8 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     shapes = {"A": (3, 3), "B": (3, 1), "E": (3, 1), "offset": (3,), "C": (2, 3), "L": (3, 2)}
     parts = {name: rng.normal(size=shape) for name, shape in shapes.items()}
     model = Innovations(**parts, S=np.eye(2), x0=np.zeros(3), P0=np.zeros((3, 3)))
-    log = Log([], ("level", "flow"), ("pump",), ("rain",), dt=0.5)
+    y, u, d = (torch.from_numpy(rng.normal(size=shape)) for shape in ((4, 2), (3, 1), (3, 1)))
+    log = Log([Trajectory(y, u, d)], ("level", "flow"), ("pump",), ("rain",), dt=0.5)
     found = Identified(model, log, 1, Fit(model, 3, 2))
     plant = read_model(found)
     assert (plant.outputs, plant.inputs, plant.known) == (log.outputs, log.inputs, log.known)
@@ -71,6 +73,11 @@ def test_the_state_space_of_an_identification_has_its_predictions():
         assert np.array_equal(getattr(plant, name), parts[name])
     with pytest.raises(QPError, match=r"^dt: got 1.0, expected the model's own 0.5. Leave dt out"):
         read_model(found, dt=1.0)
+    seen = model.estimates(y.numpy(), u.numpy(), d.numpy())[:-1]
+    x = seen @ model.A.T + model.inputs(u.numpy(), d.numpy())
+    assert plant.visited is not None
+    assert np.allclose(plant.visited[0], x.mean(0))
+    assert np.allclose(plant.visited[1], np.cov(x.T, bias=True))
     assert not read_model(found, prices=["rain"]).E.any(), "a price acts on no plant"
     more = read_model(found, known=["price", "rain", "sun"])
     assert np.array_equal(more.E, np.pad(plant.E, ((0, 0), (1, 1))))

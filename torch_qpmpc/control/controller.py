@@ -33,8 +33,8 @@ OPTIONS = ("noise", "drift")
 class Controller:
     """A `LinearMPC` with an observer, a target within bounds, the last input and names.
 
-    In each step a steady-state Kalman filter estimates the state x and constant disturbances w from
-    the measured outputs; the steady state within the bounds that is nearest to the set-point is the
+    In each step a Kalman filter estimates the state x and constant disturbances w from the
+    measured outputs; the steady state within the bounds that is nearest to the set-point is the
     target; and the MPC plans to it. So constant disturbances, and errors of the model's gain, leave
     no offset, and a set-point out of reach is tracked as near as the bounds allow.
 
@@ -43,10 +43,10 @@ class Controller:
         noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
             default those of the identification. Without one, a tenth of half the distance of the
             outputs' bounds, or without bounds of the deviation that costs one, ``1 / sqrt(Q)``.
-        drift: standard deviations of the change of each disturbance in a step; by default the
-            identified noise. Without one, a tenth of half the distance of the bounds of the output
-            or the input. A larger ratio of drift to noise rejects disturbances faster and passes on
-            more noise.
+        drift: standard deviations of the change of each disturbance in a step; by default those
+            with which it moves an output within the horizon by as much as the identified noise.
+            Without one, a tenth of half the distance of the bounds of the output or the input. A
+            larger ratio of drift to noise rejects disturbances faster and passes on more noise.
 
     Attributes:
         mpc: the MPC.
@@ -81,10 +81,11 @@ class Controller:
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
-        """Forget the past: the plant rests with the outputs y, by default the next step's.
+        """Forget the past: the plant rests with the outputs y.
 
-        `simulate` and `learn` start there, too. If the plant does not rest, pass its last input;
-        the estimates take as many steps to settle as the filter does.
+        Without them its state may be any of those in the model's log; without a log it rests with
+        the next step's outputs. `simulate` and `learn` start from rest, too. If the plant does not
+        rest, pass its last input.
 
         Args:
             y: outputs, by name or as a vector.
@@ -102,7 +103,8 @@ class Controller:
         if known is not None or y is not None:
             d = law.read_known(known, 1)[0]
             e = None if y is None else law.observer.at_rest(memory.u, d, y)
-            memory = memory._replace(known=d, e=e, rest=(y, memory.rest[1]))
+            steps = 0 if y is None else len(law.observer.gains) - 1
+            memory = memory._replace(known=d, e=e, rest=(y, memory.rest[1]), steps=steps)
         self._start(memory)
 
     def _start(self, memory: Memory) -> None:
@@ -255,7 +257,8 @@ class Controller:
             state = unpacked(content["controller"])
             options = {name: state.pop(name) for name in OPTIONS if name in state}
             controller = cls(LinearMPC.of_stored(content), **options)
-            controller._memory = Memory(**state)
+            settled = {"steps": len(controller.observer.gains) - 1}  # as in files without
+            controller._memory = Memory(**settled | state)
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller
@@ -264,8 +267,8 @@ class Controller:
         """Return a closed loop of a copy of this controller with a plant, from rest.
 
         The last `reset` says where: a model starts as near to rest with its input, the first known
-        signals and its outputs as it can; an environment starts where its own reset says, and its
-        first outputs are taken to rest with that input.
+        signals and its outputs as it can; an environment starts where its own reset says, and the
+        estimates start from any state of the model's log; without one, from rest with that input.
 
         Args:
             plant: a model as `LinearMPC` takes it, by default its own; or an environment with
@@ -300,9 +303,9 @@ class Controller:
         The design's own cost, `Run.costs`, must be shown to fall by 1 %. Then the controller starts
         again with the new model, from rest with its last input; otherwise it stays as it is. Loops
         start where the last `reset` rests; with a log's model, at rest in the middle of the
-        set-points; with an environment, where its own reset says. The filter takes a start that is
-        not at rest for a disturbance, until it has settled: the old model and the new one pay for
-        it on the same starts. On a terminal a bar shows the progress.
+        set-points; with an environment, where its own reset says. Without a log the filter takes a
+        start that is not at rest for a disturbance, until it has settled. On a terminal a bar shows
+        the progress.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed

@@ -336,6 +336,7 @@ def _sizes(law: Law) -> dict[str, int]:
         "N_Y": n_y,
         "N_D": n_d,
         "N_D_": max(n_d, 1),
+        "GAINS": len(observer.gains),
         "STAGES": stages,
         "SET_POINTS": stages if design.references == "preview" else 1,
         "N_R": width["r"],
@@ -348,9 +349,10 @@ def _sizes(law: Law) -> dict[str, int]:
 
 def _tables(law: Law, dtype: str) -> dict[str, Array]:
     """Return the constant arrays by their names in C."""
-    design, steady = law.design, law.design.steady
+    design, steady, observer = law.design, law.design.steady, law.observer
+    gains = observer.gains.reshape(len(observer.gains), -1)
     return {
-        **{key.upper(): x for key, x in law.observer._asdict().items()},
+        **{key.upper(): x for key, x in (observer._asdict() | {"gains": gains}).items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
         "ACTS": design.acts,

@@ -21,6 +21,7 @@ from torch_qpmpc.control.observer import (
     floored,
     kalman,
     max_plausible,
+    moving,
 )
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
 from torch_qpmpc.errors import QPError
@@ -34,6 +35,7 @@ class Memory(NamedTuple):
     Attributes:
         u: the last input, ``(m,)``.
         e: the prediction of x and w for the next step, None before the first.
+        steps: the place of the next gain among `Observer.gains`, the last one from rest.
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         rest: the outputs and the input at rest that the last reset was passed, or None for each.
@@ -44,6 +46,7 @@ class Memory(NamedTuple):
     r: Array = np.zeros(0)
     known: Array | None = None
     rest: tuple[Array | None, Array | None] = (None, None)
+    steps: int = 0
 
 
 class Signals(NamedTuple):
@@ -109,13 +112,14 @@ class Law:
             QPError: a deviation is invalid, or the model has no filter.
         """
         design, w = mpc.design, mpc.design.disturbances
-        share, drifts = np.full(len(design.usual), SMALL), np.full(len(w.names), SMALL)
+        share = np.full(len(design.usual), SMALL)
         if design.plant.noise is not None:
             share = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual))) / design.usual
-            of_outputs = share @ np.abs(w.C)
-            drifts = np.where(of_outputs > 0, of_outputs, share.max(initial=0.0))
+            drifts = moving(design, share * design.usual) / design.horizon**0.5
+        else:
+            drifts = np.full(len(w.names), SMALL) * design.of_w(design.usual)
         noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)
-        drift = _deviations("drift", drift, drifts * design.of_w(design.usual), w.names)
+        drift = _deviations("drift", drift, drifts, w.names)
         observer = kalman(design, noise, drift)
         largest = max_plausible(design, noise)
         return cls(mpc, noise, drift, observer, largest)
@@ -139,11 +143,15 @@ class Law:
         """Return the law with today's theta."""
         return replace(self)
 
-    def begun(self, u: Array | None = None) -> Memory:
-        """Return a memory without a past, with the last input u, by default zero, in its bounds."""
+    def begun(self, u: Array | None = None, rests: bool = False) -> Memory:
+        """Return a memory without a past, with the last input u, by default zero, in its bounds.
+
+        The plant ``rests``, or is in a state of the log; without one it rests.
+        """
         last = np.zeros(len(self.design.plant.inputs)) if u is None else u
         last = np.clip(last, *self.design.u_bounds)
-        return Memory(last, rest=(None, None if u is None else last))
+        steps = len(self.observer.gains) - 1 if rests else 0
+        return Memory(last, rest=(None, None if u is None else last), steps=steps)
 
     def estimates(self, memory: Memory) -> tuple[Array, Array]:
         """Return the predictions of x and w, zero before the first step."""
@@ -226,8 +234,11 @@ class Law:
         observer, e = self.observer, memory.e
         if e is None and not (valid and seen.all()):
             return memory, None, Outcome.INVALID
-        e = observer.at_rest(memory.u, known[0], y) if e is None else e
-        e = e + observer.L @ np.where(seen, y - observer.H @ e, 0.0)
+        k, last = memory.steps, len(observer.gains) - 1
+        if e is None:
+            e = observer.start if k < last else observer.at_rest(memory.u, known[0], y)
+        e = e + observer.gains[k] @ np.where(seen, y - observer.H @ e, 0.0)
+        memory = memory._replace(steps=min(k + 1, last))
         status = Outcome.SOLVED if seen.all() else Outcome.MISSING
         return memory, e, status if valid else Outcome.INVALID
 

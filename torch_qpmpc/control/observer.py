@@ -12,6 +12,7 @@ from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.disturbance import check_observable
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.innovations import Innovations
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1
@@ -21,18 +22,25 @@ LEAST = 1e-3
 ON_CIRCLE = 1e-9
 #: A smaller singular value, relative to the largest, determines no estimate at rest.
 REST = 1e-12
+#: A gain that differs from the steady one by a smaller part of it is steady, ..
+SETTLED = 1e-2
+#: .. and so is each after so many.
+MOST_GAINS = 100
 #: Signals above this multiple of a usual size are errors: estimates would lose their digits.
 ABSURD = 1e8
 
 
 class Observer(NamedTuple):
-    """e = [x; w] is predicted by ``F e + G u + E d + offset``, and corrected by ``L (y - H e)``.
+    """e = [x; w] is predicted by ``F e + G u + E d + offset``, and corrected by ``L_k (y - H e)``.
 
     Attributes:
         F, G, E, offset: the model of e.
         H: the outputs of e.
-        L: the gain.
-        rest: the map of [-G u - E d - offset; y] to the e that rests with u, d and y.
+        gains: L_0, .., L_T, ``(T + 1, n_e, n_y)``; the last one is the steady one, and the only one
+            without a log.
+        start: the mean of e in the log, where a controller starts.
+        rest: the map of [-G u - E d - offset; y] to the e that rests with u, d and y, where it
+            starts without a log.
     """
 
     F: Array
@@ -40,8 +48,14 @@ class Observer(NamedTuple):
     E: Array
     offset: Array
     H: Array
-    L: Array
+    gains: Array
+    start: Array
     rest: Array
+
+    @property
+    def L(self) -> Array:
+        """The steady gain."""
+        return self.gains[-1]
 
     def predicted(self, e: Array, u: Array, d: Array) -> Array:
         """Return the e after e with the input u and the known signals d."""
@@ -54,11 +68,14 @@ class Observer(NamedTuple):
 
 
 def kalman(design: Design, noise: Array, drift: Array) -> Observer:
-    """Return the steady-state Kalman filter of a design's model.
+    """Return the Kalman filter of a design's model, with its gains until it is steady.
 
     The noise of the state and the outputs is that of an identification. Without one, white noise
     acts on each input, with `SMALL` times its half range as standard deviation, and on each output.
     White noise acts on the change of each disturbance in a step.
+
+    The first state is one of the identification's log, with disturbances that move the outputs by
+    `SMALL` of their usual deviations.
 
     Args:
         design: the design.
@@ -89,11 +106,19 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         L = np.linalg.solve(H @ P @ H.T + V, H @ P + V @ G.T).T
         stable = np.abs(np.linalg.eigvals(F - F @ L @ H)).max() < 1 - ON_CIRCLE
     except (ValueError, np.linalg.LinAlgError):
-        L, stable = np.zeros((n + n_w, n_y)), False
+        P, L, stable = np.zeros((n + n_w, n + n_w)), np.zeros((n + n_w, n_y)), False
     if not stable:
         got = "a model whose Kalman filter does not converge"
         remedy = "It has a mode on the unit circle that no input moves: remove it."
         raise QPError.expected("model", got, "a model with a steady-state filter", remedy)
+    start, gains = np.zeros(n + n_w), L[None]
+    if plant.visited is not None:
+        start[:n] = plant.visited[0]
+        loads = np.diag((moving(design, SMALL * design.usual) / of_w) ** 2)
+        none, S = np.zeros((n + n_w, 0)), H @ P @ H.T + V
+        first = np.asarray(block_diag(plant.visited[1], loads)) - P
+        filtered = Innovations(F, none, none, start, H, L, S, start, first)
+        gains = np.concatenate((filtered.gains(MOST_GAINS, SETTLED), gains))
     rest = np.linalg.pinv(np.vstack((F - np.eye(n + n_w), H)), rcond=REST)
     below, own = ((0, n_w), (0, 0)), design.disturbances
     return Observer(
@@ -102,9 +127,25 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         np.pad(model.E, below),
         np.pad(model.offset, (0, n_w)),
         np.hstack((model.C, own.C)),
-        of_e[:, None] * L / of_y,
+        of_e[:, None] * gains / of_y,
+        of_e * start,
         of_e[:, None] * rest / np.concatenate((of_e, of_y)),
     )
+
+
+def moving(design: Design, sizes: Array) -> Array:
+    """Return the disturbances that move an output by its size within the horizon, ``(n_w,)``.
+
+    An input's is at most `SMALL` of its range.
+    """
+    plant, w = design.plant, design.disturbances
+    x, moved = np.zeros(w.B.shape), np.abs(w.C)
+    for _ in range(design.horizon):
+        x = plant.A @ x + w.B
+        moved = np.maximum(moved, np.abs(plant.C @ x + w.C))
+    with np.errstate(divide="ignore"):
+        by_output = (sizes[:, None] / moved).min(0, initial=np.inf)
+    return np.minimum(by_output, SMALL * design.of_w(np.full(len(sizes), np.inf)))
 
 
 def floored(S: Array, usual: Array) -> Array:

@@ -75,11 +75,13 @@ class Scaling(NamedTuple):
             plant.E * (d / x[:, None]),
             plant.offset / x,
         )
-        noise = plant.noise
+        noise, visited = plant.noise, plant.visited
         if noise is not None:
             noise = noise[0] * (y / x[:, None]), noise[1] / y / y[:, None]
+        if visited is not None:
+            visited = visited[0] / x, visited[1] / x / x[:, None]
         names = plant.inputs, plant.outputs, plant.known
-        return StateSpace(*matrices, None, *names, noise=noise)
+        return StateSpace(*matrices, None, *names, noise=noise, visited=visited)
 
     def at_rest(
         self, plant: StateSpace, u: Array, d: Array, y: Array | None = None, weight: float = 1.0

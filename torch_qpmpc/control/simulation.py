@@ -135,7 +135,9 @@ def simulate(
     if not ((noise >= 0) & np.isfinite(noise)).all():
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
     y, last = memory.rest
-    begun = law.begun(last if u is None else read_row("u", u, design.plant.inputs))
+    begun = law.begun(
+        last if u is None else read_row("u", u, design.plant.inputs), not hasattr(plant, "reset")
+    )
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
         plant = _Model(model, design, d, begun.u, y, FAINT if u is not None else 1.0, x)
@@ -319,7 +321,7 @@ def probe(law: Law, known: Array) -> Probe:
     course = Course(x, LOAD * size_u, quiet, r[:, None].repeat(rows, 1), constant)
     costs: dict[str, float] = {}
     states, last = [], u
-    for signals, move in own_loop(law, course, law.policy(law.begun(u)), PROBED):
+    for signals, move in own_loop(law, course, law.policy(law.begun(u, True)), PROBED):
         states.append(move.p)
         for name, weight, signal, names in (
             ("Q", design.Q, signals.y - _first(move.target.y), plant.outputs),

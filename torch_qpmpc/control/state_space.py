@@ -12,6 +12,7 @@ import scipy.linalg
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.identification import Identified
+from torch_qpmpc.mpc.subspace import visited
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
 Array = np.ndarray
@@ -30,6 +31,7 @@ class StateSpace:
         inputs, outputs, known: names of the entries of u, y and d.
         units: units by name, where known.
         noise: L ``(n, n_y)`` and S ``(n_y, n_y)`` of an identification, see `Innovations`.
+        visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -46,6 +48,7 @@ class StateSpace:
     known: tuple[str, ...]
     units: Mapping[str, str] = field(default_factory=dict)
     noise: tuple[Array, Array] | None = None
+    visited: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -100,10 +103,10 @@ def read_model(
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
     if isinstance(model, StateSpace):
         return model
-    offset, units, noise = None, {}, None
+    offset, units, noise, states = None, {}, None, None
     if isinstance(model, Identified):
         A, B, E, offset, C, L, S, *_ = model.model
-        noise = L, S
+        noise, states = (L, S), visited(model.model, model.log.trajectories)
         log, dt = model.log, _own_dt(dt, model.log.dt)
         units = dict(log.units)
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
@@ -132,7 +135,7 @@ def read_model(
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
-    return StateSpace(A, B, C, E, offset, dt, *names, units, noise)
+    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states)
 
 
 def read_row(name: str, value: Any, names: Sequence[str]) -> Array:

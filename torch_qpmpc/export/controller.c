@@ -4,7 +4,7 @@
 /* An observer of e = [x; w], the state and constant disturbances; a QP for the steady state that is
    nearest to the set-point, or two if that leaves inputs free; and a QP for the plan to it.
 
-       e  is corrected by L (y - H e), and predicted by F e + G u + E d + OFFSET
+       e  is corrected by L_k (y - H e), and predicted by F e + G u + E d + OFFSET
        [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QPs
        u = u_s + the plan's first input, within the bounds */
 
@@ -13,6 +13,9 @@ typedef policy_real real;
 enum { N_X = POLICY_N_X, N_W = POLICY_N_W, N_E = POLICY_N_E, N_U = POLICY_N_U };
 enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_A = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
 enum { N_V = N_A + POLICY_N_F, STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
+
+enum { LAST = POLICY_GAINS - 1 }; /* the steady gain */
+enum { UNKNOWN = -2, STARTS = -1 }; /* of steps: before known signals, and before estimates */
 
 /* @TABLES@ */
 
@@ -44,7 +47,7 @@ static int are_sane(const real *x, const real most[], int rows, int columns)
 /* Return x within the bounds of input i, some of which are known signals: in the last valid row. */
 static real within(const policy_state *s, real x, int i)
 {
-    int seen = s->starts < 2;
+    int seen = s->steps > UNKNOWN;
     real lower = seen && LOWER_OF[i] >= 0 ? s->known[LOWER_OF[i]] : U_LOWER[i];
     real upper = seen && UPPER_OF[i] >= 0 ? s->known[UPPER_OF[i]] : U_UPPER[i];
     if (x < lower) x = lower;
@@ -83,12 +86,13 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
     int i, j, missing = 0, valid = are_sane(known, MOST_KNOWN, stages, N_D);
     if (valid) {
         copy(s->known, known, N_D);
-        if (s->starts) s->starts = 1;
+        if (s->steps < 0) s->steps = STARTS;
     }
-    if (s->starts) {
+    if (s->steps < 0) {
         if (!valid || !y || !are_sane(y, MOST_Y, 1, N_Y)) return POLICY_INVALID;
-        rest(s, y);
-        s->starts = 0;
+        if (LAST) copy(s->e, START, N_E);
+        else rest(s, y);
+        s->steps = 0;
     }
     for (i = 0; i < N_Y; i++) {
         error[i] = 0;
@@ -99,7 +103,8 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
         error[i] = y[i];
         for (j = 0; j < N_E; j++) error[i] -= H[i][j] * s->e[j];
     }
-    add(s->e, &L[0][0], N_E, N_Y, error);
+    add(s->e, GAINS[s->steps], N_E, N_Y, error);
+    if (s->steps < LAST) s->steps++;
     return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
 }
 
@@ -178,13 +183,13 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
     for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;
-    s->starts = 2;
+    s->steps = UNKNOWN;
     for (i = 0; i < N_U; i++) s->u[i] = within(s, u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
     if (y && are_sane(y, MOST_Y, 1, N_Y) && (!N_D || (known && are_sane(known, MOST_KNOWN, 1, N_D)))) {
         copy(s->known, known, N_D);
         rest(s, y);
-        s->starts = 0;
+        s->steps = LAST;
     }
 }
 
@@ -193,7 +198,7 @@ int policy_observe(policy_state *s, const real y[], const real u[], const real k
     int i, code = see(s, y, known, 1);
     real applied[N_U];
     for (i = 0; i < N_U; i++) applied[i] = u && is_sane(u[i], MOST_U[i]) ? u[i] : s->u[i];
-    if (!s->starts) predict(s, applied);
+    if (s->steps >= 0) predict(s, applied);
     for (i = 0; i < N_U; i++) s->u[i] = within(s, applied[i], i);
     return code;
 }
@@ -204,7 +209,7 @@ int policy_step(policy_state *s, const real y[], const real r[], const real know
     if (r && sane) copy(s->r, r, SET_POINTS * N_Y);
     code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
     for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
-    if (!s->starts) predict(s, s->u);
+    if (s->steps >= 0) predict(s, s->u);
     copy(u, s->u, N_U);
     return code ? code : seen;
 }

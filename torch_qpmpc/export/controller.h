@@ -38,7 +38,7 @@ typedef struct {
 #if POLICY_N_F
     policy_free_state free;
 #endif
-    int starts;                                  /* 1 before there are estimates, 2 before known signals */
+    int steps;                                   /* the place of the next gain; negative before a start */
 } policy_state;
 
 /* A number is missing if it is not finite, or above MOST_Y, MOST_KNOWN or MOST_U of policy.c, 1e8
@@ -46,7 +46,8 @@ typedef struct {
 
 /* Forget the past: the plant rests with the outputs y, the input u and the known signals of this
    step, of which there are POLICY_N_D. If one of y or known is missing, or the pointer is null, it
-   rests with those of the first step; a missing entry of u is zero. u is clipped into its bounds.
+   is in a state of the log of the model; without a log it rests with those of the first step. A
+   missing entry of u is zero. u is clipped into its bounds.
 
    u is the last input, which moves are counted from: another than the plant's is a bump. */
 void policy_reset(policy_state *state, const policy_real y[], const policy_real u[],

@@ -73,21 +73,22 @@ class Innovations(NamedTuple):
         P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.swapaxes(-1, -2)) @ self.A.T
         return gain, V, (P + P.swapaxes(-1, -2)) / 2
 
-    def settling(self, steps: int) -> Iterator[tuple[Array, Array]]:
+    def settling(self, steps: int, settled: float = SETTLED) -> Iterator[tuple[Array, Array]]:
         """Yield the gains L_0, L_1, .. from P0 and their outputs' covariances, at most ``steps``.
 
-        They end before the first gain that is equal to L within rounding.
+        They end before the first gain that is equal to L within the part ``settled`` of it.
         """
         P, size = self.P0, np.sqrt(np.maximum(np.diag(self.S), 0))
         for _ in range(steps):
             gain, V, P = self.gain(P)
-            if np.abs((gain - self.L) * size).max() <= SETTLED * np.abs(self.L * size).max():
+            if np.abs((gain - self.L) * size).max() <= settled * np.abs(self.L * size).max():
                 return
             yield gain, V
 
-    def gains(self, steps: int) -> Array:
+    def gains(self, steps: int, settled: float = SETTLED) -> Array:
         """Return the gains of `settling` ``(steps', n, n_y)``."""
-        return np.array([gain for gain, _ in self.settling(steps)]).reshape(-1, *self.L.shape)
+        gains = [gain for gain, _ in self.settling(steps, settled)]
+        return np.array(gains).reshape(-1, *self.L.shape)
 
     def estimates(self, y: Array, u: Array, d: Array) -> Array:
         r"""Return \xi_0, .., \xi_T ``(*batch, T + 1, n)`` of trajectories of equal length.

@@ -163,13 +163,27 @@ def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     return np.mean(inside, 0)
 
 
+def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
+    """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
+    states = []
+    for (y, v), _ in _batches(_signals(trajectories)):
+        inputs = model.inputs(*np.split(v, [model.B.shape[1]], -1))
+        after = model.estimates(y, *np.split(v, [model.B.shape[1]], -1))[..., :-1, :]
+        states.append((after @ model.A.T + inputs).reshape(-1, len(model.A)))
+    x = np.concatenate(states)
+    return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
+
+
+def _signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
+    return [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
+
+
 def _errors(
     model: Innovations, trajectories: Sequence[Trajectory], horizon: int
 ) -> Iterator[Array]:
     """Yield multi-step errors ``(G, T, horizon, n_y)`` of the trajectories of each length."""
     n_u = model.B.shape[1]
-    data = [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
-    for (y, v), _ in _batches(data):
+    for (y, v), _ in _batches(_signals(trajectories)):
         yield model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
 
 

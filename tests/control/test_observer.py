@@ -1,0 +1,107 @@
+"""The filter of a model with a log starts from the states of the log, in Python and in C."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+import torch_qpmpc as qm
+from tests.control.controllers import exported
+from torch_qpmpc.control.observer import SETTLED, moving
+from torch_qpmpc.control.state_space import read_model
+
+A, B, C = np.array([[0.9, 0.1], [0.0, 0.7]]), np.array([[0.0], [0.5]]), np.array([[1.0, 0.0]])
+NOISE = np.array([[0.4], [0.3]]), np.array([[0.04]])
+VISITED = np.array([2.0, 1.0]), np.array([[1.0, 0.3], [0.3, 0.5]])
+
+
+def filtered(**options) -> qm.Controller:
+    """Return the controller of a plant with a hidden state, and the noise and states of a log."""
+    plant = replace(read_model((A, B, C)), noise=NOISE, visited=VISITED)
+    options = {"u_bounds": (-2.0, 2.0), **options}
+    return qm.Controller(qm.LinearMPC(plant, 8, Q=1.0, R=0.1, **options))
+
+
+def test_estimates_are_the_means_of_the_states_given_all_outputs():
+    """Outputs, states and disturbances are one Gaussian vector: its conditional mean is exact."""
+    controller, rng = filtered(), np.random.default_rng(0)
+    o, design = controller.observer, controller.mpc.design
+    steps, n_e = 5, len(o.F)
+    loads = moving(design, 0.1 * design.usual)
+    V = NOISE[1] + np.diag((1e-3 * design.usual) ** 2)
+    # Rows of e_0, v_0, d_0, v_1, .. in these sources: e_0, then the noise v and drift d of a step.
+    first = np.diag([*np.zeros(2), *loads**2])
+    first[:2, :2] = VISITED[1]
+    step = np.diag([V[0, 0], *controller._law.drift**2])
+    sources = n_e + steps * len(step)
+    cov = np.zeros((sources, sources))
+    cov[:n_e, :n_e] = first
+    for k in range(steps):
+        at = n_e + k * len(step)
+        cov[at : at + len(step), at : at + len(step)] = step
+    of_e, mean = np.eye(n_e, sources), o.start.copy()
+    G, W = np.vstack((NOISE[0], [[0.0]])), np.vstack((np.zeros((2, 1)), [[1.0]]))
+    seen, means, ys = [], [], []
+    for k in range(steps):
+        at = n_e + k * len(step)
+        of_v, of_d = np.eye(1, sources, at), np.eye(1, sources, at + 1)
+        seen.append(o.H @ of_e + of_v)
+        means.append(o.H @ mean)
+        ys.append(rng.normal(2.0, 1.0, 1))
+        u = controller.step(ys[-1], [0.5])
+        of_e = o.F @ (of_e + G @ of_v) + W @ of_d
+        mean = o.F @ mean + o.G @ u + o.offset
+        R, off = np.concatenate(seen), np.concatenate(ys) - np.concatenate(means)
+        exact = mean + of_e @ cov @ R.T @ np.linalg.solve(R @ cov @ R.T, off)
+        assert np.allclose(np.concatenate((controller.x, controller.w)), exact, atol=1e-9)
+
+
+def test_gains_end_where_they_are_steady_and_a_plant_at_rest_has_the_last_one():
+    controller = filtered()
+    gains = controller.observer.gains
+    off = np.abs(gains - gains[-1]).max((1, 2)) / np.abs(gains[-1]).max()
+    assert 3 < len(gains) <= 101
+    assert off[0] > 10 * SETTLED
+    controller.reset(y=[1.0], u=[0.0])
+    before = np.concatenate((controller.x, controller.w))
+    u = controller.step([1.5], [0.5])
+    o = controller.observer
+    after = o.predicted(before + o.L @ ([1.5] - o.H @ before), u, np.zeros(0))
+    assert np.allclose(np.concatenate((controller.x, controller.w)), after)
+
+
+def test_a_disturbance_drifts_within_the_horizon_by_the_noise_of_the_outputs():
+    x = responses = np.zeros(2)
+    for _ in range(8):
+        x = A @ x + B[:, 0]
+        responses = np.maximum(responses, x)
+    for kind, bound, reach in (("output", 2.0, 1.0), ("u1", 20.0, responses[0])):
+        law = filtered(disturbances={"y1": kind}, u_bounds=(-bound, bound))._law
+        assert np.allclose(law.noise, 0.2, rtol=1e-4)
+        assert np.allclose(law.drift, law.noise / reach / 8**0.5)
+    law = filtered(disturbances={"y1": "u1"}, u_bounds=(-0.2, 0.2))._law
+    assert np.allclose(law.drift, 0.1 * 0.2 / 8**0.5), "at most a tenth of the input's range"
+
+
+def test_c_starts_from_the_same_states_and_settles_alike():
+    controller, twin = exported(filtered)
+    rng = np.random.default_rng(1)
+    for y, u in ((None, None), ([0.3], [0.5])):
+        controller.reset(y, u)
+        twin.reset(y, u, None)
+        for k in range(2 * len(controller.observer.gains)):
+            y = [rng.normal(1.0, 0.5) if k != 3 else np.nan]
+            input_, code = twin.step(y, [[0.5]])
+            assert np.allclose(controller.step(y, [0.5]), input_, atol=1e-9)
+            assert controller.status == code == (4 if k == 3 else 0)
+
+
+def test_a_saved_controller_settles_as_if_it_had_not_been_saved(tmp_path):
+    controller = filtered()
+    controller.step([2.5], [0.5])
+    controller.save(tmp_path / "c.qpmpc")
+    again = qm.Controller.load(tmp_path / "c.qpmpc")
+    for y in ([1.0], [2.0]):
+        assert np.array_equal(controller.step(y), again.step(y))
+        assert np.array_equal(controller.x, again.x)
