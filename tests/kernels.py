@@ -5,9 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import torch_qpmpc.qp.kernels
-
-FOLDER = Path(torch_qpmpc.qp.kernels.__file__).parent
+FOLDER = Path(__file__).parents[1] / "torch_qpmpc" / "qp" / "kernels"
 #: Written when all kernels are compiled.
 DONE = FOLDER / "__pycache__" / "compiled"
 

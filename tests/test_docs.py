@@ -20,10 +20,9 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.experiment.tasks.code import named_task
+from torch_qpmpc.proofs import invariant
 from torch_qpmpc.qp import solvers
 
-#: Pages whose Python takes more than a few seconds.
-SLOW = {f"docs/guides/{name}.md" for name in ("engineer", "environment", "prove", "torchrl")}
 #: The modules whose docstrings have examples.
 EXAMPLES = sorted(
     path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
@@ -51,16 +50,19 @@ def test_blocks_are_found():
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, marks=pytest.mark.slow if page in SLOW else ())
+        # README.md learns by TorchRL in small.
+        pytest.param(page, marks=pytest.mark.slow if page == "docs/guides/torchrl.md" else ())
         for page, text in PAGES.items()
         if fenced(text, "python")
     ],
 )
+@pytest.mark.usefixtures("rough_fits")
 def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     """Block after block, as a reader would paste them into one session."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
     monkeypatch.setattr(solvers, "BACKENDS", dict(solvers.BACKENDS))
+    monkeypatch.setattr(invariant, "GAINS", (1.0,))  # saturated laws take longer
     namespace: dict[str, object] = {"__name__": "page"}
     for line, code in fenced(PAGES[page], "python"):
         # Blank lines first, so that a traceback names the page's own line.
@@ -105,7 +107,10 @@ def test_modules_that_commands_run_exist(module):
 @needs_docs
 @pytest.mark.slow
 def test_the_task_of_the_guide_trains(tmp_path):
-    """As a script, in the runs of a sweep, which are processes of their own."""
+    """As a script, in the runs of a sweep, which are processes of their own.
+
+    Tests of tasks and of sweeps run both apart, in one process.
+    """
     blocks = [code for _, code in fenced(PAGES["docs/guides/task.md"], "python")]
     (script,) = (code for code in blocks if "register(" in code)
     (tmp_path / "my_task.py").write_text(script, encoding="utf-8")

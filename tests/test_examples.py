@@ -22,6 +22,7 @@ SHORT = (
 NAMES = sorted(x.stem for x in FOLDER.glob("*.py") if "register(" in x.read_text("utf-8"))
 
 
+@pytest.mark.usefixtures("rough_fits")
 @pytest.mark.parametrize("name", NAMES)
 def test_an_example_learns_for_two_updates(name, tmp_path):
     file = FOLDER / f"{name}.py"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import json
@@ -64,6 +65,17 @@ def test_notebook_runs(path, monkeypatch):
     finally:
         plt.close("all")
         logging.disable(logging.NOTSET)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_what_a_notebook_imports_exists(path):
+    code = "".join(
+        line for cell in cells(path) for line in (*cell["source"], "\n") if line[:1] != "%"
+    )
+    tree = ast.parse(code)
+    tree.body = [x for x in tree.body if isinstance(x, ast.Import | ast.ImportFrom)]
+    assert tree.body
+    exec(compile(tree, path.name, "exec"), {"__name__": path.stem})
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

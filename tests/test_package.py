@@ -18,10 +18,7 @@ import torch_qpmpc
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / ".github" / "readme_examples.py"
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not EXAMPLES.exists(), reason="not a clone of the repository"),
-]
+pytestmark = pytest.mark.skipif(not EXAMPLES.exists(), reason="not a clone of the repository")
 
 
 def run(*command: str | Path) -> None:
@@ -72,6 +69,7 @@ def test_the_module_is_train_py(tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.slow
 def test_the_module_of_the_wheel_is_its_own_train_py(built, tmp_path):
     """It has a copy of train.py and configs/."""
     folder = built[1].parent / "unpacked"

@@ -72,7 +72,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Claim:
-    """A command and its numbers; ``quick`` commands run with the slow tests."""
+    """A command and its numbers; ``quick`` commands run in ``.ci/run``."""
 
     command: str
     numbers: list[Number]

@@ -86,7 +86,7 @@ def test_a_set_point_at_a_soft_bound_with_a_large_price_is_certified(tmp_path):
     controller = qm.Controller(mpc)
     twin = load(controller.export_c(tmp_path).files, controller)
     x = np.zeros(4)
-    for _ in range(60):
+    for _ in range(30):
         u = controller.step(x[:1], [18.0])
         got, code = twin.step(x[:1], [18.0])
         assert code == 0

@@ -11,6 +11,11 @@ import pytest
 from torch_qpmpc.experiment.tasks import TASKS
 
 
+@pytest.fixture(autouse=True)
+def _quick(rough_fits: None) -> None:
+    """Fit roughly in all tests of runs."""
+
+
 @pytest.fixture
 def store_task() -> Iterator[None]:
     """Register ``task=store`` for a test."""

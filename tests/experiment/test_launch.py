@@ -111,7 +111,6 @@ def test_the_first_signal_is_noted_and_the_second_acts(listening):
     ("module", "name", "call", "signum", "said"),
     [
         (train, "make_physics", 1, signal.SIGTERM, "before the first update"),
-        (evaluation, "evaluate", 1, signal.SIGINT, "before the first update"),
         (Replay, "extend", 1, signal.SIGINT, "before the first update"),
         (Replay, "extend", 4 + 2, signal.SIGTERM, "after update 2"),
         (train, "save_checkpoint", 1, signal.SIGTERM, "after update 3"),

@@ -20,7 +20,14 @@ from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.run_state import resumed
 
 #: The stop is at neither an evaluation nor a row of metrics, and an episode ends after it.
-RUN = (*SMALL, "updates=8", "eval_interval=4", "log_interval=3", "task.episode_steps=10")
+RUN = (
+    *SMALL,
+    "updates=8",
+    "eval_interval=4",
+    "log_interval=3",
+    "task.episode_steps=10",
+    "task.eval_steps=5",
+)
 STOP = 5
 SECOND = "optimizer=gauss_newton"
 LOOPS = ("optimizer=closed_loop", "optimizer.loops=2", "optimizer.steps=6", "optimizer.members=2")

@@ -19,7 +19,6 @@ from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start
-from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -37,12 +36,6 @@ def _log(*settings: str) -> TensorDictBase:
 def log_of(*settings: str) -> TensorDictBase:
     """Return a copy of a log that is collected once."""
     return _log(*settings).clone()
-
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit costs roughly: tests/mpc/test_stage_cost.py compares the fits."""
-    monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
 
 
 def start_of(cfg: DictConfig):

@@ -34,7 +34,8 @@ LAUNCHERS = {
 def arguments(folder: Path, *overrides: str) -> list[str]:
     """Return the arguments of ``-m +study=paper`` with small runs."""
     study = ("-m", "+study=paper", "constraint=free", "noise=gaussian")
-    return [*study, *SMALL, f"hydra.sweep.dir={folder}", *overrides]
+    short = ("updates=1", "eval_interval=1", "task.eval_steps=2")
+    return [*study, *SMALL, *short, f"hydra.sweep.dir={folder}", *overrides]
 
 
 @pytest.mark.parametrize(

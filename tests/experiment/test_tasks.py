@@ -321,16 +321,14 @@ def test_the_arguments_that_resume_are_quoted():
     assert resume_arguments("runs/1", {"name": "point_mass", "file": "x.py"}) == "resume=runs/1"
 
 
-@pytest.mark.parametrize("registered", [True, False])
-def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch, registered):
-    """The user's script has registered it, or the command line names the script."""
+def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
+    """The command line names the script that registers it."""
     file = own_task('defaults={"task": {"horizon": 3}}')
     cfg, whole, cut = make_config("task=mine", *SMALL), tmp_path / "whole", tmp_path / "cut"
     train.train(cfg, str(whole), quiet=True)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    if not registered:
-        del TASKS["mine"]
-    run_command(f"resume={cut}", *([] if registered else [f"task.file={file}"]))
+    del TASKS["mine"]
+    run_command(f"resume={cut}", f"task.file={file}")
     assert_same_numbers(cut, whole)
 
 

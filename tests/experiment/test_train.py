@@ -48,7 +48,7 @@ def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 WHOLE = (
     *("optimizer=adam", "solver=daqp", "seed=5", "constraint=combined"),
-    *("updates=50", "eval_interval=35", "gate=false", "rivals=false"),
+    *("updates=30", "eval_interval=25", "gate=false", "rivals=false"),
 )
 
 
@@ -74,18 +74,18 @@ def test_folder_is_complete(whole):
     folder, summary = whole
     assert summary == json.loads((folder / "summary.json").read_text())
     names = {"step": "cholesky", "seed": 5, "constraint": "combined", "noise": "gaussian"}
-    assert {**summary, **names, "solver": "daqp", "updates": 50, "ablation": None} == summary
+    assert {**summary, **names, "solver": "daqp", "updates": 30, "ablation": None} == summary
     assert 0 < summary["train_seconds"] < 600
     assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
     assert (folder / "summary.png").exists()
     assert (folder / "episode.png").exists()
     table = metrics(folder)
-    assert sorted(table.index) == sorted({*range(0, 51, 10), 35})
+    assert sorted(table.index) == sorted({*range(0, 31, 10), 25})
     J = table["eval/J"].dropna()
-    assert list(J.index) == [0, 35, 50]
-    assert (J[0], J[50]) == (summary["J_start"], summary["J_final"])
+    assert list(J.index) == [0, 25, 30]
+    assert (J[0], J[30]) == (summary["J_start"], summary["J_final"])
     columns = ["loss/value", "loss/si", "train/td_error", "train/reward", "qp/solves", "time/qp"]
-    assert np.isfinite(table.drop(index=[0, 35])[columns]).all(axis=None)
+    assert np.isfinite(table.drop(index=[0, 25])[columns]).all(axis=None)
     assert table["qp/residual"].max() < 1e-6
 
 
@@ -170,18 +170,6 @@ def test_training_continues_past_unsolved_qps(tmp_path):
     assert np.isfinite(table["loss/value"]).all()
     state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
     assert all(value.isfinite().all() for value in state.values())
-
-
-def test_the_second_order_learns_in_tens_of_updates(tmp_path):
-    overrides = ("solver=daqp", "seed=5", "constraint=combined", "figures=false", "gate=false")
-    summary = train.train(make_config(*overrides, "updates=40", "eval_interval=40"), str(tmp_path))
-    assert summary["closed_gap"] > 0.85
-    assert summary["unsolved"] == 0
-    table = metrics(tmp_path)
-    errors = table["train/td_error"]
-    assert errors.iloc[-10:].mean() < 0.5 * errors.iloc[1:6].mean()
-    assert (table["train/accepted"].dropna() == 1).mean() > 0.7
-    assert table["train/damping"].min() >= 0.03
 
 
 def test_a_bad_configuration_writes_nothing(tmp_path):
@@ -343,7 +331,6 @@ class Faulty(PointMassGymEnv):
     [
         ("data", 0.01, True, 0, None),
         ("model", 1.0, True, 0, "The plant ends episodes by ArithmeticError: the integrator fail"),
-        ("data", 1.0, False, 0, None),
         ("model", 1.0, False, 0, "Return a number from the environment's step, or end the episode"),
         ("data", 0.5, False, 3, "Return a number from the environment's step, or end the episode"),
     ],

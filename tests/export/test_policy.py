@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 
 import numpy as np
@@ -52,8 +53,9 @@ def check(mpc, folder, count=200, seed=0, **settings):
     return cold, codes
 
 
-@pytest.mark.parametrize("name", SCHEMES)
-@pytest.mark.parametrize("storage", ["fast", "small"])
+@pytest.mark.parametrize(
+    ("name", "storage"), [*zip(SCHEMES, itertools.cycle(("fast", "small")), strict=False)]
+)
 def test_a_scheme_agrees_with_an_exact_solver(name, storage, tmp_path):
     check(SCHEMES[name](), tmp_path, storage=storage)
 
@@ -172,10 +174,10 @@ def test_compilers_agree_without_a_warning(name, level, exported):
     np.testing.assert_allclose(found[solved], expected[solved], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("storage", ["fast", "small"])
-def test_sanitizers_find_nothing(storage, exported, tmp_path):
+def test_sanitizers_find_nothing(tmp_path):
+    """Those of a controller's C, in tests/control/test_bad_hours.py, see the other storage."""
     mpc = tied(4, state_slack=torch.inf)
-    export_c(mpc, tmp_path, storage=storage)
+    export_c(mpc, tmp_path, storage="small")
     (tmp_path / "p.bin").write_bytes(draw_known(mpc, 40).tobytes())
     flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     try:

@@ -16,40 +16,6 @@ def unravel_keys(key: Any) -> tuple[str, ...]:
     return (key,) if isinstance(key, str) else key
 
 
-KEYS = {
-    "advantage": "advantage",
-    "value_target": "value_target",
-    "value": "state_value",
-    "state_action_value": "state_action_value",
-    "action": "action",
-    "priority": "td_error",
-    "reward": "reward",
-    "done": "done",
-    "terminated": "terminated",
-    "priority_weight": "priority_weight",
-}
-
-
-@pytest.mark.parametrize("estimator", TRACE)
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_keys_reach_the_estimator(estimator, when):
-    names = ("advantage", "value_target", "value", "reward", "done", "terminated")
-    # The estimator requires its network to write the value's key.
-    loss = QPQLearningLoss(make_operator({"state_value_key": "value_2"}))
-    loss.set_keys(value="value_2")
-    assert ("next", "reward") in loss.in_keys
-    if when == "after":
-        loss.make_value_estimator(estimator)
-    loss.set_keys(**{name: f"{name}_2" for name in names})
-    if when == "before":
-        loss.make_value_estimator(estimator)
-    assert [getattr(loss.value_estimator.tensor_keys, n) for n in names] == [
-        f"{n}_2" for n in names
-    ]
-    assert ("next", "reward_2") in loss.in_keys
-    assert ("next", "reward") not in loss.in_keys
-
-
 RENAMED = {
     "observation": ("agent", "state"),
     "action": ("agent", "force"),

@@ -65,6 +65,7 @@ def test_a_qp_of_an_identification_acts_on_its_states():
 # The report
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_the_report_is_printed():
     text = str(qm.identify(lag_log(noise=0.2), N))
     signals, order, white, head, *rows = text.splitlines()
@@ -84,6 +85,7 @@ def test_errors_are_those_of_data_that_the_fit_has_not_seen():
     assert ((found.R2 > 0.5) & (found.R2 < 1)).all()
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_a_collinear_output_leaves_the_predictions_as_good():
     log = lag_log(noise=0.2, steps=200)
     twice: Any = log.clone()

@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 import torch
 
+from torch_qpmpc.mpc import subspace
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.log import Trajectory
 from torch_qpmpc.mpc.subspace import fit_state_space, held_out_errors, whiteness
@@ -16,6 +17,12 @@ B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 1.0]])
 C = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.5]])
 # Each noise has its own source.
 Q, R = 0.01 * np.eye(3), np.diag([0.04, 0.02])
+
+
+@pytest.fixture(autouse=True)
+def few_orders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try no orders far above those of the plants."""
+    monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4, 5, 6))
 
 
 def trajectory(y, u, d=None) -> Trajectory:

@@ -186,7 +186,8 @@ STRUCTURED: dict[str, tuple[dict[str, Any], list[float]]] = {
 
 
 @pytest.mark.parametrize(
-    ("name", "solver"), zip(STRUCTURED, itertools.cycle(("proxqp", "daqp", "torch")), strict=False)
+    ("name", "solver"),
+    [*zip(STRUCTURED, itertools.cycle(("proxqp", "daqp", "torch")), strict=False)],
 )
 def test_derivatives_where_a_controller_spends_its_life(name, solver):
     options, s = STRUCTURED[name]
@@ -523,7 +524,7 @@ KEPT = ("masked", "varying, mixed", "projected block", "tied, full", "preview, t
 
 @pytest.mark.parametrize(
     ("name", "way"),
-    zip(KEPT, itertools.cycle((copy.deepcopy, pickled, without_values)), strict=False),
+    [*zip(KEPT, itertools.cycle((copy.deepcopy, pickled, without_values)), strict=False)],
 )
 def test_twins_give_the_same_answers_and_are_independent(tmp_path, name, way):
     """Files and checkpoints know the settings; the ways of a copy do not."""

@@ -63,29 +63,35 @@ def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]], threads: int | N
     assert torch.get_num_threads() == threads
 
 
-def scenario() -> None:
-    """Solve with two threads, in children started in each way, and again, with shared modules."""
+def scenario(method: str, *solvers: str) -> None:
+    """Solve with two threads, in a child, and again, with shared modules."""
     torch.set_num_threads(2)
     torch.ones(2_000_000).exp().sum()  # OpenMP's threads exist when the child is forked
-    mpcs = [random_mpc(0, solver=name).share_memory() for name in BACKENDS]
+    mpcs = [random_mpc(0, solver=name).share_memory() for name in solvers or BACKENDS]
     expected = [answers(mpc) for mpc in mpcs]
-    for method in ("fork", "spawn"):
-        if method not in torch.multiprocessing.get_all_start_methods():
-            continue  # not on every platform
-        context: Any = torch.multiprocessing.get_context(method)
-        threads = 2 if method == "fork" else None
-        child = context.Process(target=check, args=(mpcs, expected, threads), daemon=True)
-        child.start()
-        child.join(WATCHDOG)
-        hung = child.exitcode is None
-        assert child.exitcode == 0, f"{method}: {'it hung' if hung else 'it failed'}"
-        check(mpcs, expected)
-        assert torch.get_num_threads() == 2
+    context: Any = torch.multiprocessing.get_context(method)
+    threads = 2 if method == "fork" else None
+    child = context.Process(target=check, args=(mpcs, expected, threads), daemon=True)
+    child.start()
+    child.join(WATCHDOG)
+    assert child.exitcode == 0, "it hung" if child.exitcode is None else "it failed"
+    check(mpcs, expected)
+    assert torch.get_num_threads() == 2
 
 
-@pytest.mark.slow
-def test_a_child_has_the_answers_of_its_parent():
-    code = "from tests.pytorch.test_processes import scenario; scenario()"
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("fork", "daqp"),
+        pytest.param(("fork",), marks=pytest.mark.slow),
+        pytest.param(("spawn",), marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
+)
+def test_a_child_has_the_answers_of_its_parent(arguments):
+    if arguments[0] not in torch.multiprocessing.get_all_start_methods():
+        pytest.skip("not on this platform")
+    code = f"from tests.pytorch.test_processes import scenario; scenario(*{arguments!r})"
     # In a separate session, so that hanging grandchildren can be killed, too.
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
     try:

@@ -80,7 +80,7 @@ def test_a_report_has_runs_with_missing_numbers(study, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "sweep" / "run")
     summary = json.loads((copy / "summary.json").read_text())
     names = ("J_best", "J_start", "J_true_model", "closed_gap", "canonical_distance")
-    for missing in (names[:1], names):
+    for missing in (names,):
         nulls = dict.fromkeys(missing) | {"proof": "proved"}
         (copy / "summary.json").write_text(json.dumps(summary | nulls))
         report.main([str(tmp_path)])

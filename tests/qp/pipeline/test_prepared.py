@@ -10,21 +10,7 @@ from torch.func import functional_call
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
-from torch_qpmpc.qp.pipeline import condensing
 from torch_qpmpc.qp.pipeline.batch import LATEST, Programs
-
-
-@pytest.fixture
-def eliminations(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """Record the matrices that are eliminated during the test."""
-    eliminated, eliminate = [], condensing.eliminate
-
-    def counting(C: np.ndarray, *arguments):
-        eliminated.append(C)
-        return eliminate(C, *arguments)
-
-    monkeypatch.setattr(condensing, "eliminate", counting)
-    return eliminated
 
 
 def test_a_theta_that_the_batch_shares_is_prepared_once():
@@ -68,19 +54,6 @@ def test_threads_prepare_for_themselves():
     with ThreadPoolExecutor(1) as pool:
         there = pool.submit(Programs.of, *theta, fixed).result()[0].prepared
     assert there is not here
-
-
-def test_value_action_value_and_policy_share_one_elimination(eliminations):
-    mpc = random_mpc(40)
-    s, a = random_states(6), random_states(6, 1, size=0.5)
-    for solve in (mpc.value, mpc.policy, lambda s: mpc.action_value(s, a)):
-        solve(s)
-    assert len(eliminations) == 1
-    with torch.no_grad():
-        mpc.C += 0.01
-    mpc.action_value(s, a)
-    mpc.value(s)
-    assert len(eliminations) == 2
 
 
 def test_an_update_in_place_and_back_is_followed():

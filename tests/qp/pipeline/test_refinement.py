@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from tests.campaign.families import Draw, parallel_rows
 from tests.problems import known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline import refinement
-from torch_qpmpc.qp.pipeline.refinement import Twice, _dot, _product, refine
+from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
@@ -104,19 +103,3 @@ def test_what_has_no_solution_is_left_as_it_was():
     candidate = solution._replace(chi=chi)
     assert refine(p, candidate, np.arange(2)).tolist() == [0, 1]
     assert_close(candidate.z, solution.z, rtol=0, atol=0)
-
-
-def test_products_have_twice_the_working_precision():
-    generator = np.random.default_rng(1)
-    matrix = generator.standard_normal((5, 37)) * 10.0 ** generator.integers(-8, 8, (5, 37))
-    high = generator.standard_normal(37)
-    x = Twice(high, high * 2.0**-60)
-    exact = [
-        sum(Fraction(m) * (Fraction(a) + Fraction(b)) for m, a, b in zip(row, *x, strict=True))
-        for row in matrix
-    ]
-    size = np.abs(matrix) @ np.abs(high)
-    for row, (value, low) in enumerate(zip(*_product(matrix, x), strict=True)):
-        assert abs(float(Fraction(value) + Fraction(low) - exact[row])) < 1e-29 * size[row]
-    square = sum((Fraction(a) + Fraction(b)) ** 2 for a, b in zip(*x, strict=True))
-    assert_close(_dot(x, x), float(square), rtol=1e-15, atol=0)

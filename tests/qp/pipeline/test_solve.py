@@ -185,19 +185,6 @@ def test_only_rejected_solutions_are_solved_again(monkeypatch, asked):
     assert log.fallback == 3
 
 
-def test_a_wrong_answer_to_a_warm_start_is_solved_again_cold(monkeypatch, asked):
-    def misled(p: Programs, active: np.ndarray) -> BatchSolution:
-        return p.recover(LIES["v off"](daqp.solve(p.reduced_qps())))
-
-    monkeypatch.setattr(Programs, "recalled", misled)
-    known = known_qp(2, batch=(BATCH,))
-    active = solve(known, solver="daqp").active
-    with SolveLog() as log:
-        assert_right(solve(known, solver="recorder", warm_start=active), known)
-    assert counts(asked) == [BATCH]
-    assert (log.fallback, log.recalled) == (0, 0)
-
-
 def one_by_one(known: KnownQP, rest: AtRest) -> list[BatchSolution]:
     return [rest.solve(s[None]) for s in known.fixed.numpy()]
 
@@ -237,16 +224,6 @@ def test_qps_at_rest_have_the_solutions_of_a_batch(seed, units):
                 assert np.abs(one - other).max() <= 1e-9 * (1 + np.abs(other).max())
     assert (log.solves, log.unsolved) == (20, int((~batch.solved).sum()))
     assert log.recalled > 0
-
-
-def test_what_the_last_set_does_not_solve_gets_to_the_solver(monkeypatch, asked):
-    known = shared(1)
-    right = solve(known, solver="daqp")
-    monkeypatch.setattr(Programs, "recalled", lambda p, active: p.unsolved(0))
-    rest = at_rest(known, "recorder")
-    for answer, value in zip(one_by_one(known, rest), right.value, strict=True):
-        assert_close(answer.value[0], value.item())
-    assert counts(asked) == [1] * 20
 
 
 def test_a_cost_that_is_not_convex_has_no_solution_at_rest():

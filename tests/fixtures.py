@@ -1,0 +1,182 @@
+"""The fixtures of all tests; xdist's own process, which runs none, does not import them."""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+import functools
+import gc
+import io
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import pytest
+import torch
+from hydra._internal.core_plugins.importlib_resources_config_source import (
+    ImportlibResourcesConfigSource,
+)
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf, _utils, base, grammar_parser
+
+import train
+from tests.runs import SMALL, make_config
+from torch_qpmpc.control import exporting
+from torch_qpmpc.experiment.tasks import identified
+from torch_qpmpc.export import comparison, library
+from torch_qpmpc.learning import closed_loop
+from torch_qpmpc.mpc import identification, stage_cost, subspace
+from torch_qpmpc.mpc.log import Trajectory
+from torch_qpmpc.qp.solvers import BACKENDS
+
+#: Resolution of the tests' figures.
+SMALL_DPI = 40
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that exists before the first test out of the collections of garbage; have few."""
+    gc.freeze()
+    gc.set_threshold(20_000, 20)
+    gc.enable()
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    """Limit torch to one thread: test workers run in parallel.
+
+    Set before every test, because TorchRL's ``check_env_specs`` changes the number.
+    """
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(params=[*BACKENDS, "qpsolvers:clarabel"])
+def solver(request: pytest.FixtureRequest) -> str:
+    """Return the name of each backend in turn."""
+    return request.param
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_exports() -> Iterator[None]:
+    """Compile exports without optimisation and once each, and compare them at few states."""
+    compile_now = library.compiled
+
+    @functools.lru_cache(maxsize=64)
+    def once(command: tuple[str, ...], files: tuple[tuple[str, str], ...], flags: tuple[str, ...]):
+        return compile_now(dict(files), flags)
+
+    def compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
+        return once((*library.required_compiler(),), (*sorted(files.items()),), (*flags,))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (exporting, library):
+            patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
+            patch.setattr(module, "compiled", compiled)
+        for module in (exporting, comparison):
+            patch.setattr(module, "COMPARED", 60)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_configurations() -> Iterator[None]:
+    """Read, find and parse each text of a configuration and each interpolation once."""
+    load = OmegaConf.load
+    of_text = functools.cache(lambda text: load(io.StringIO(text)))
+    parse = functools.cache(grammar_parser.parse)
+
+    def load_once(file: Any) -> Any:
+        return copy.deepcopy(of_text(file.read())) if isinstance(file, io.IOBase) else load(file)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OmegaConf, "load", load_once)
+        for module in (base, _utils):
+            patch.setattr(module, "parse", parse)
+        for name in ("is_config", "is_group"):
+            patch.setattr(ImportlibResourcesConfigSource, name, once_a_path(name))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_identifications() -> Iterator[None]:
+    """Fit the same log once: stopped, resumed and undisturbed runs identify the same model."""
+    fit, known = subspace.fit_state_space, {}
+
+    def once(trajectories: Sequence[Trajectory], *options: int | None, **named: int | None) -> Any:
+        data = tuple((x.shape, x.numpy().tobytes()) for one in trajectories for x in one)
+        key = (data, options, subspace.ORDERS, *named.items())
+        if key not in known:
+            known[key] = fit(trajectories, *options, **named)
+        return copy.deepcopy(known[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (subspace, identification, identified, closed_loop):
+            patch.setattr(module, "fit_state_space", once)
+        yield
+
+
+@pytest.fixture
+def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fit models and costs roughly: the tests of mpc compare the fits."""
+    monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4))
+    monkeypatch.setattr(subspace, "LAGS", (2, 10))
+    monkeypatch.setattr(subspace, "MANY", 8)
+    monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
+
+
+def once_a_path(name: str) -> Callable[[ImportlibResourcesConfigSource, str], bool]:
+    """Return a method of a package's configurations, of which each path is looked up once."""
+    method, known = getattr(ImportlibResourcesConfigSource, name), {}
+
+    def answer(source: ImportlibResourcesConfigSource, config_path: str) -> bool:
+        key = source.path, config_path
+        if key not in known:
+            known[key] = method(source, config_path)
+        return known[key]
+
+    return answer
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_disks() -> Iterator[None]:
+    """Let writes return before the disk has them: no test cuts the power."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Draw small figures without their layout; modules that are marked ``layout`` keep both."""
+    save = Figure.savefig
+
+    def save_small(figure: Figure, *arguments: Any, **options: Any) -> None:
+        save(figure, *arguments, **options | {"dpi": SMALL_DPI})
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("layout") is None:
+            patch.setattr(Figure, "get_layout_engine", lambda _: None)  # nor drawn twice for it
+            patch.setattr(Figure, "savefig", save_small)
+            patch.setitem(matplotlib.rcParams, "figure.dpi", SMALL_DPI)
+        yield
+
+
+@pytest.fixture
+def two_threads(one_thread: None) -> None:
+    """Let torch, and with it ProxQP, use two threads."""
+    torch.set_num_threads(2)
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Train two sweeps of small runs; seed 4 starts without a real gap."""
+    folder = tmp_path_factory.mktemp("runs")
+    runs = [("gaussian", "fixed", 1), *(("gaussian", "free", i) for i in (1, 4))]
+    for noise, case, seed in (*runs, ("brownian", "free", 1)):
+        settings = (f"constraint={case}", f"noise={noise}", f"seed={seed}", "task.eval_steps=20")
+        place = folder / "small" / f"{noise}-{case}-seed{seed}"
+        train.train(make_config(*SMALL, *settings), str(place), quiet=True)
+    for c_2 in (0.0, 0.5):
+        settings = (f"constraint.deviation.c_2={c_2}", "task.eval_steps=20")
+        train.train(make_config(*SMALL, *settings), str(folder / "weights" / f"{c_2}"), quiet=True)
+    return folder
