@@ -64,16 +64,16 @@ LAYERS = {
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
-    ".": 435,
-    "analysis": 1032,
+    ".": 377,
+    "analysis": 1027,
     "control": 4361,
-    "envs": 1457,
+    "envs": 1445,
     "experiment": 3350,
     "export": 1445,
-    "learning": 2770,
-    "mpc": 5133,
+    "learning": 2768,
+    "mpc": 5120,
     "proofs": 1003,
-    "qp": 5915,
+    "qp": 5893,
     "study": 548,
 }
 #: Libraries that only some layers may import.

@@ -28,10 +28,10 @@ def check_kind(name: str, value: Any, kind: type, remedy: str = "") -> None:
         raise QPError.expected(name, got, f"{article} {kind.__name__}", remedy)
 
 
-def check_whole(name: str, value: Any, least: int, remedy: str = "") -> None:
+def check_whole(name: str, value: Any, least: int) -> None:
     """Raise `QPError` unless ``value`` is an integer, NumPy's included, of at least ``least``."""
     if not isinstance(value, Integral) or isinstance(value, bool) or int(value) < least:
-        raise QPError.expected(name, repr(value), f"a whole number >= {least}", remedy)
+        raise QPError.expected(name, repr(value), f"a whole number >= {least}")
 
 
 def check_seed(seed: Any) -> None:
@@ -70,16 +70,8 @@ def check_tensor(
 ) -> Tensor:
     """Return ``value`` if it is a floating-point tensor of the expected shape and device.
 
-    Args:
-        name: the argument's name.
-        value: the argument.
-        event: its trailing dimensions; a string stands for any size.
-        batched: accept leading batch dimensions.
-        device: the required device; any by default.
-        remedy: the message's end if the shape is wrong.
-
-    Raises:
-        QPError: its type, shape or device is wrong.
+    ``event`` are its trailing dimensions; a string stands for any size. Leading dimensions need
+    ``batched``. ``remedy`` ends the message of a wrong shape.
     """
     if not isinstance(value, Tensor) or not value.is_floating_point():
         got = value.dtype if isinstance(value, Tensor) else class_name(value)

@@ -22,26 +22,11 @@ class QPError(ValueError):
 
 
 def printable(text: str) -> str:
-    """Return ``text`` without characters that control a terminal, which a file may have brought.
-
-    Example:
-        >>> printable("a\\x1b[31mb")
-        'a\\\\x1b[31mb'
-    """
+    """Return ``text`` without characters that control a terminal, which a file may have brought."""
     return "".join(
         x if x.isprintable() or x in "\n\t" else x.encode("unicode_escape").decode() for x in text
     )
 
 
 class SolverError(RuntimeError):
-    """A QP has no certified solution: it is infeasible, unbounded, or not solved to tolerance.
-
-    Example:
-        >>> import torch, torch_qpmpc as qm
-        >>> bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
-        >>> mpc = qm.QPMPC.of(1, 1, 3, **bounds)
-        >>> mpc.value(torch.tensor([2.0]))  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        torch_qpmpc.errors.SolverError: 1 of 1 QPs have no certified solution. 1 INFEASIBLE: ...
-    """
+    """A QP has no certified solution: it is infeasible, unbounded, or not solved to tolerance."""

@@ -21,11 +21,7 @@ VERSION = 1
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
-    """Write ``data`` to ``path`` atomically; a symbolic link is replaced, not followed.
-
-    Raises:
-        OSError: writing failed, as on a full disk; the old file is unchanged.
-    """
+    """Write ``data`` to ``path`` atomically; a symbolic link is replaced, not followed."""
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.unlink(missing_ok=True)
@@ -54,23 +50,14 @@ def labelled(kind: str, content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
-    """Write ``content``, tensors and plain values by name, as a file of a ``kind``.
-
-    Raises:
-        OSError: writing failed; the old file is unchanged.
-    """
+    """Write ``content``, tensors and plain values by name, as a file of a ``kind``."""
     buffer = io.BytesIO()
     torch.save(labelled(kind, content), buffer)
     write_whole(Path(path), buffer.getbuffer())
 
 
 def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
-    """Read the content of a file of a ``kind``, which the class ``writer`` wrote, or that kind's.
-
-    Raises:
-        QPError: the file is missing, damaged, of another kind or of a newer version, or holds more
-            than tensors and plain values.
-    """
+    """Read a file of a ``kind``, which the class ``writer`` wrote, or that kind's."""
     expected = f"a file that {writer or kind}.save wrote"
     try:
         content = read_tensors(Path(path))

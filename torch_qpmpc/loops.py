@@ -21,35 +21,13 @@ class Step(NamedTuple):
 
 
 def run_loop(
-    policy: Callable[[Any], Any],
-    known: Any,
-    step: Callable[[Any], Step],
-    steps: int,
-    ends: type[Exception] | tuple[type[Exception], ...] = (),
+    policy: Callable[[Any], Any], known: Any, step: Callable[[Any], Step], steps: int
 ) -> Iterator[Step]:
-    """Yield (known, action, cost) of each step.
+    """Yield (known, action, cost) of each of at most ``steps`` steps.
 
-    Args:
-        policy: maps what it sees to an action.
-        known: what it sees first.
-        step: moves the plant by an action.
-        steps: the largest number of steps.
-        ends: errors of the policy that end the loop.
-
-    Example:
-        >>> x = 1.0
-        >>> def step(a):
-        ...     global x
-        ...     x, cost = 0.5 * x + a, x * x
-        ...     return Step(x, a, cost)
-        >>> [s.cost for s in run_loop(lambda x: -0.25 * x, x, step, 3)]
-        [1.0, 0.0625, 0.00390625]
+    ``policy`` maps what it sees, first ``known``, to an action, and ``step`` moves the plant by it.
     """
     for _ in range(steps):
-        try:
-            action = policy(known)
-        except ends:
-            return
-        stepped = step(action)
+        stepped = step(policy(known))
         known = stepped.known
         yield stepped

@@ -111,7 +111,7 @@ def chosen(*overrides):
 def start_of(cfg, physics):
     """Return the MPC of a log, with zero action held."""
     start = candidates(cfg, physics, collect_log(cfg, physics))[OUTPUTS]
-    return start._replace(held=torch.zeros(1, dtype=torch.float64))
+    return start._replace(action=torch.zeros(1, dtype=torch.float64))
 
 
 def test_the_candidates_have_the_regulators_cost(monkeypatch):
@@ -135,7 +135,7 @@ def test_the_candidates_have_the_regulators_cost(monkeypatch):
 def test_a_start_that_costs_less_than_zero_action_is_chosen():
     cfg, _, start, choice = chosen(*DATA, "task.start_episodes=6")
     rows = choice.table
-    assert start.held is None
+    assert start.action is None
     assert {OUTPUTS, f"{OUTPUTS}{FIRST}", ZERO_ACTION} <= {*rows.index}
     assert rows.episodes[choice.name] == rows.episodes[ZERO_ACTION] == 6
     assert rows.J[choice.name] < rows.J[ZERO_ACTION]
@@ -224,7 +224,7 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     s = torch.randn(8, physics.n_x, dtype=torch.float64)
     assert make_mpc(cfg, physics, start).policy(s).abs().max() < 1e-12, "rounding alone"
     action = torch.tensor([0.25], dtype=torch.float64)
-    mpc = make_mpc(cfg, physics, start._replace(held=action))
+    mpc = make_mpc(cfg, physics, start._replace(action=action))
     assert_close(mpc.policy(s), action.expand(8, 1), atol=1e-7, rtol=0)
     costs = -log.get(("next", "reward")).double()
     assert_close(mpc.value(s), (10 * costs.mean()).expand(8), atol=1e-5, rtol=0)
@@ -241,7 +241,10 @@ def test_the_gate_copies_a_held_action_into_the_scheme_that_learning_begins_with
     physics: Any = make_physics(cfg)
     start = start_of(cfg, physics)
     physics = start.plant(physics)
-    held, scheme = make_mpc(cfg, physics, start), make_mpc(cfg, physics, start._replace(held=None))
+    held, scheme = (
+        make_mpc(cfg, physics, start),
+        make_mpc(cfg, physics, start._replace(action=None)),
+    )
     scheme.load_state_dict(held.state_dict())
     assert scheme.policy(torch.ones(1, physics.n_x, dtype=torch.float64)).abs() < 1e-12
 

@@ -138,12 +138,7 @@ def _draw_regions(axes: Axes, mapped: PolicyMap) -> None:
 
 
 def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
-    """Plot the value, an action, its local gain and the active sets on a slice of the states.
-
-    Args:
-        mapped: a `PolicyMap`.
-        action: index of the action.
-    """
+    """Plot the value, an action by its index, its local gain and the active sets of a map."""
     figure = Figure(figsize=(12, 9), layout="constrained")
     (value, policy), (gain, sets) = figure.subplots(2, 2)
     u, name = mapped.actions[..., action], f"{{{action + 1}}}"

@@ -28,10 +28,8 @@ class KalmanFilter(Transform):
 
     Args:
         model: the model.
-        observation_key, action_key: the keys of output and action.
+        observation_key: the key of the output.
         estimate_key: the key of the estimate, by default that of the output, which it replaces.
-        preview_key: the key of known signals, whose first entries are those of the step, of a model
-            that has any.
 
     Raises:
         QPError: the environment's output or action does not have the model's size.
@@ -60,12 +58,9 @@ class KalmanFilter(Transform):
         model: Innovations,
         *,
         observation_key: NestedKey = "observation",
-        action_key: NestedKey = "action",
         estimate_key: NestedKey | None = None,
-        preview_key: NestedKey = "preview",
     ) -> None:
-        self.observation_key, self.action_key = observation_key, action_key
-        self.preview_key = preview_key
+        self.observation_key = observation_key
         self.estimate_key = observation_key if estimate_key is None else estimate_key
         super().__init__(in_keys=[observation_key], out_keys=[self.estimate_key])
         for name in ("A", "B", "E", "offset", "C", "x0"):
@@ -99,8 +94,8 @@ class KalmanFilter(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         y, step = next_tensordict[self.observation_key], tensordict["filter_step"] + 1
-        x, u, n_d = tensordict[self.estimate_key], tensordict[self.action_key], self.E.shape[-1]
-        d = tensordict[self.preview_key][..., :n_d] if n_d else x[..., :0]
+        x, u, n_d = tensordict[self.estimate_key], tensordict["action"], self.E.shape[-1]
+        d = tensordict["preview"][..., :n_d] if n_d else x[..., :0]
         next_tensordict.set(self.estimate_key, self.following(x, u, d, y, step.squeeze(-1)).to(y))
         return next_tensordict.set("filter_step", step)
 
@@ -137,7 +132,7 @@ class KalmanFilter(Transform):
             present = ", ".join(map(str, observation_spec.keys(True, True)))
             raise QPError.expected("observation_key", name, f"one of {present}")
         assert parent is not None
-        n_u = parent.full_action_spec[self.action_key].shape[-1]
+        n_u = parent.full_action_spec["action"].shape[-1]
         got, want = (y.shape[-1] if y.shape else 0, n_u), (len(self.C), self.B.shape[-1])
         if got != want or not y.dtype.is_floating_point:
             got = f"outputs and actions of sizes {got}, {y.dtype}"

@@ -110,15 +110,13 @@ class Plant(ABC):
         """Return the `violation` of each transition of a collected ``batch``."""
         return batch["violation"]
 
-    def vectorised(
-        self, num_envs: int, max_steps: int, seed: int, episodes: int | None = None
-    ) -> EnvBase:
+    def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps.
 
         Its observation is the output or, with an ``observer``, the estimate of its state. ``seed``
-        seeds signals and starts; ``episodes`` is as in `PlantEnv`.
+        seeds signals and starts.
         """
-        env = PlantEnv(self, num_envs, max_steps, seed=seed, episodes=episodes or EPISODES)
+        env = PlantEnv(self, num_envs, max_steps, seed=seed)
         return env if self.observer is None else TransformedEnv(env, KalmanFilter(self.observer))
 
 

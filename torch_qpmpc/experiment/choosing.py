@@ -85,7 +85,7 @@ class Choice(NamedTuple):
     def of(self, start: Start, physics: AnyPlant) -> Start:
         """Return the start of `scheme`, which holds zero action if that is chosen."""
         action = zero_action(physics)(physics.lb_a[None])[0]
-        return start._replace(held=action if self.name == ZERO_ACTION else None, choice=self)
+        return start._replace(action=action if self.name == ZERO_ACTION else None, choice=self)
 
     def write(self, folder: Path) -> None:
         """Write the table into a run's folder."""

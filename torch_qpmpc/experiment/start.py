@@ -111,9 +111,9 @@ def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
 
     The gate keeps the action. Without a gate what is learned is kept, from the action on.
     """
-    if start is None or start.held is None or not cfg.gate:
+    if start is None or start.action is None or not cfg.gate:
         return start
-    return start._replace(held=None)
+    return start._replace(action=None)
 
 
 @torch.no_grad()

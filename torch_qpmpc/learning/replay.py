@@ -81,7 +81,6 @@ class Replay:
         window: N, transitions per window.
         num_windows: M, windows per sample.
         seed: seed of the replay's generator, which all sampling uses instead of torch's global one.
-        device: device of the stored data and of the generator.
         active_rows: n_g, to store the active sets of Q(s, a) and V(s+) with each transition, n_g
             bytes each, under `ACTIVE_SETS`; see `remember`.
         preview_key: see `windows_to_tau`.
@@ -104,7 +103,6 @@ class Replay:
         num_windows: int,
         *,
         seed: int = 0,
-        device: torch.device | str = "cpu",
         active_rows: int | None = None,
         preview_key: NestedKey | None = None,
     ) -> None:
@@ -114,8 +112,8 @@ class Replay:
             raise QPError.expected("capacity", capacity, expected, remedy)
         self.window, self.num_envs, self.active_rows = window, num_envs, active_rows
         self.preview_key = preview_key
-        self.generator = torch.Generator(device=device).manual_seed(seed)
-        storage = LazyTensorStorage(capacity, ndim=2, device=device)
+        self.generator = torch.Generator().manual_seed(seed)
+        storage = LazyTensorStorage(capacity, ndim=2, device="cpu")
         options: dict[str, Any] = {"storage": storage, "generator": self.generator}
         # ReplayBuffer, not TensorDictReplayBuffer: that one fails on batches with T = 1.
         self.transitions = ReplayBuffer(sampler=RandomSampler(), batch_size=batch_size, **options)
@@ -208,7 +206,7 @@ class Replay:
         storage, writer = self.transitions.storage, self.transitions.writer
         storage.load_state_dict(state["storage"])
         writer.load_state_dict(state["writer"])
-        self.generator.set_state(state["generator"].cpu())
+        self.generator.set_state(state["generator"])
         if len(self) == storage.max_size:
             # TorchRL saves the writer's position but not the storage's copy of it, which keeps
             # windows from crossing the ring's seam. Writing the newest row again restores the copy.

@@ -163,27 +163,27 @@ class Layout:
         return torch.cat((d, rows[:, self.n_z - self.n_x :]), dim=-1)
 
     @property
-    def held_stages(self) -> Tensor:
+    def repeating(self) -> Tensor:
         """True for the stages that repeat the action of the stage before, ``(N,)``."""
-        held = torch.full((self.horizon,), bool(self.blocks))
-        held[torch.tensor((0, *self.blocks[:-1])).cumsum(0)] = False
-        return held
+        repeating = torch.full((self.horizon,), bool(self.blocks))
+        repeating[torch.tensor((0, *self.blocks[:-1])).cumsum(0)] = False
+        return repeating
 
-    def hold_rows(self) -> Tensor:
-        """Return the rows of u_k - u_{k-1} for the held stages, ``(h n_u, n_z)``."""
+    def repetitions(self) -> Tensor:
+        """Return the rows of u_k - u_{k-1} for the stages that repeat, ``(h n_u, n_z)``."""
         unit = torch.eye(self.n_z, dtype=torch.float64)
         actions = unit[self.n_preview : -self.n_x].unflatten(0, (-1, self.n))[:, self.n_x :]
-        return (actions[1:] - actions[:-1])[self.held_stages[1:]].flatten(0, 1)
+        return (actions[1:] - actions[:-1])[self.repeating[1:]].flatten(0, 1)
 
     def repeated(self, of_actions: Tensor) -> Tensor:
         """Return True at the rows of G that bound the actions of repeated stages, ``(n_g,)``.
 
         ``of_actions`` ``(n_mixed,)`` is True for the rows of D that bound actions alone.
         """
-        held, none = self.held_stages.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
-        u = F.pad(held, (0, 0, 0, 1)).expand(-1, self.n_u)
+        repeating, none = self.repeating.unsqueeze(-1), torch.zeros(1, self.n_x, dtype=torch.bool)
+        u = F.pad(repeating, (0, 0, 0, 1)).expand(-1, self.n_u)
         D_f = none.new_zeros(self.n_terminal)
-        return self.rows(none, u, held & of_actions, D_f)
+        return self.rows(none, u, repeating & of_actions, D_f)
 
     def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
         """Return H ``(n_z, n_z)`` (eq:qpH) from the ``blocks`` of a ``kind`` of hessian.

@@ -133,7 +133,7 @@ class QPMPC(nn.Module):
     slack_discount: Tensor
     soft: Tensor
     hardness: Tensor
-    hold: Tensor
+    repetitions: Tensor
     repeated: Tensor
 
     def __init__(
@@ -240,6 +240,9 @@ class QPMPC(nn.Module):
             trajectories, horizon, n_d, n_x: see `identify`.
             options: as in `of`, such as cost and bounds.
 
+        Raises:
+            QPError: as in `identify` and `QPMPC`, or there is neither a stage cost nor rewards.
+
         Example:
             >>> import torch, torch_qpmpc as qm
             >>> env = qm.envs.PointMassEnv(num_envs=4, max_steps=50, seed=0)
@@ -268,8 +271,8 @@ class QPMPC(nn.Module):
     def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> Self:
         """Return a linear MPC scheme with all parts learned (eq:v1, eq:q1).
 
-        It is `from_model` with other defaults: ``structure="tied"``, dense weights, discounted
-        slack weights, and all parts of theta in ``learn``. `release` frees C.
+        It is `from_model`, with its arguments and errors, and other defaults: ``structure="tied"``,
+        dense weights, discounted slack weights, and all parts of theta in ``learn``.
 
         Args:
             A, B, horizon, options: see `from_model`.
@@ -483,8 +486,8 @@ class QPMPC(nn.Module):
             H, q, w = self._cost(theta)
             c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
             if self.layout.blocks:
-                hold = self.hold.expand(*C.shape[:-2], -1, -1)
-                C, b = torch.cat((C, hold), -2), F.pad(b, (0, hold.shape[-2]))
+                rows = self.repetitions.expand(*C.shape[:-2], -1, -1)
+                C, b = torch.cat((C, rows), -2), F.pad(b, (0, rows.shape[-2]))
                 lb = lb.masked_fill(self.repeated, -torch.inf)
                 ub = ub.masked_fill(self.repeated, torch.inf)
             return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
@@ -512,6 +515,9 @@ class QPMPC(nn.Module):
     @classmethod
     def load(cls, path: str | Path) -> QPMPC:
         """Return the QPMPC that `save` wrote to ``path``, on the CPU, with all of theta.
+
+        Raises:
+            QPError: the file is missing, damaged, of another kind or of a newer release.
 
         Example:
             >>> import tempfile, torch_qpmpc as qm
@@ -630,7 +636,8 @@ class QPMPC(nn.Module):
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
         if self.layout.blocks:
             repeated = self.layout.repeated(self.scheme.of_actions).to(self.soft) & ~self.soft
-            self.register_buffer("hold", self.layout.hold_rows().to(self.C_0), persistent=False)
+            repetitions = self.layout.repetitions().to(self.C_0)
+            self.register_buffer("repetitions", repetitions, persistent=False)
             self.register_buffer("repeated", repeated, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
@@ -693,8 +700,8 @@ class QPMPC(nn.Module):
         with full_precision(self.C_0):
             C, b = self.schedule.constraints(s, self.horizon)
             C, b = C - self.C_start, b - self.b_start
-        held = qp.b.shape[-1] - b.shape[-1]  # rows of blocks
-        C, b = qp.C + F.pad(C, (0, 0, 0, held)), qp.b + F.pad(b, (0, held))
+        more = qp.b.shape[-1] - b.shape[-1]  # rows of blocks
+        C, b = qp.C + F.pad(C, (0, 0, 0, more)), qp.b + F.pad(b, (0, more))
         return replace(qp, C=C, b=b, check_values=False)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:

@@ -33,12 +33,6 @@ def nearest_psd(H: Tensor) -> Tensor:
 
     An asymmetric H is replaced by its symmetric part; semidefinite matrices stay to the last bit,
     and those with NaN or inf, which the solve of the QP rejects.
-
-    Example:
-        >>> import torch
-        >>> nearest_psd(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))
-        tensor([[0.5000, 0.5000],
-                [0.5000, 0.5000]])
     """
     return _replaced(H, _without_negative_eigenvalues)
 

@@ -57,16 +57,6 @@ def tighten(
 
     Raises:
         QPError: an argument does not fit, or the bounds are learned.
-
-    Example:
-        >>> import torch_qpmpc as qm
-        >>> one = torch.ones(1, 1)
-        >>> mpc = qm.QPMPC.from_model(
-        ...     one, one, 2, stage_weight=[1.0, 0.1], state_bounds=([-5.0], [5.0])
-        ... )
-        >>> tighten(mpc, prediction_covariance(one, 0.25 * one, 2))
-        >>> mpc.ub[mpc.soft].numpy().round(3)  # of x_0, x_1 and x_2
-        array([5.   , 4.178, 3.837])
     """
     check_kind("mpc", mpc, QPMPC)
     n_x, n_u, N = mpc.n_x, mpc.n_u, mpc.horizon

@@ -70,9 +70,9 @@ def check_one_model(mpc: Any) -> None:
         raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
 
 
-def as_tensor(name: str, value: Any, differentiable: bool = False) -> Tensor:
+def as_tensor(name: str, value: Any) -> Tensor:
     """Convert by `read_numbers`; raise `QPError` unless all entries are finite."""
-    tensor = read_numbers(name, value, differentiable)
+    tensor = read_numbers(name, value)
     if not tensor.isfinite().all():
         raise QPError.expected(name, "NaN or inf", "finite entries")
     return tensor
@@ -109,13 +109,9 @@ def ungraded(name: str, value: Any) -> Any:
     return value
 
 
-def read_numbers(name: str, value: Any, differentiable: bool = False) -> Tensor:
-    """Convert to a float64 tensor on the CPU, which may have NaN or inf.
-
-    Raise `QPError` where there are no real numbers, or an argument that is not ``differentiable``
-    requires a gradient.
-    """
-    value = value if differentiable else ungraded(name, value)
+def read_numbers(name: str, value: Any) -> Tensor:
+    """Convert to a float64 tensor on the CPU, which may have NaN or inf."""
+    value = ungraded(name, value)
     of_scipy = hasattr(value, "toarray")
     if of_scipy or (isinstance(value, Tensor) and value.layout != torch.strided):
         remedy = f"Convert it: {name}.{'toarray' if of_scipy else 'to_dense'}()."

@@ -83,14 +83,10 @@ def gradients(
     needed: Sequence[bool],
     n_kept: int,
 ) -> list[Tensor | None]:
-    """Return the gradients in H, q, c, C, b, G, lb, ub, w, fixed, None where not ``needed``.
+    """Return the gradients in theta: H, q, c, C, b, G, lb, ub, w, fixed; None if not ``needed``.
 
-    Args:
-        incoming: the gradients in value, z, chi, lam and xi; None for zero.
-        theta: H, .., w, fixed.
-        solution: z, chi, lam, xi and status.
-        needed: True for each tensor of theta whose gradient is computed.
-        n_kept: see `Programs.of`.
+    ``incoming`` are those in value, z, chi, lam and xi, None for zero, ``solution`` z, chi, lam, xi
+    and status; ``n_kept`` is that of `Programs.of`.
     """
     grad_value, *grad_solution = incoming
     grads: list[Tensor | None] = [None] * len(theta)

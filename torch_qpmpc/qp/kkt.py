@@ -56,9 +56,8 @@ def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def solve_kkt(*arguments: Any) -> KKTSolution:
     """Solve the KKT system for p, r, t and u, in condensed form for the whole batch at once.
 
-    Args:
-        arguments: the gradients in z, lam, chi and xi; z, lam and status; H, q, c, C, b, G, lb, ub,
-            w and fixed; and n_kept, see `Programs.of`. The gradients of unsolved elements are zero.
+    The ``arguments`` are the gradients in z, lam, chi and xi; z, lam, status; H, .., fixed; and
+    n_kept of `Programs.of`. The gradients of unsolved elements are zero.
     """
     grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, fixed, n_kept = arguments
     # Under vmap the gradients may have batch dimensions that the QP lacks.
@@ -163,13 +162,9 @@ def implied_equalities(
     """Return a mask of independent weakly active rows that others turn into equalities, ``(n_g,)``.
 
     A row with outward normal n stays at its bound if -n is a non-negative combination of the
-    others' normals plus any of the held rows': no feasible direction leaves it. Two opposite rows
-    are the simplest case; z_1 >= 0, z_2 >= 0, z_1 + z_2 <= 0 is another.
-
-    Args:
-        G: the rows in the free variables, ``(n_g, d)``.
-        lower, upper: masks of the rows with a zero multiplier at these bounds.
-        held: mask of the rows that are held already.
+    others' normals plus any of the ``held`` rows': no feasible direction leaves it. Two opposite
+    rows are the simplest case. ``lower`` and ``upper`` are masks of the rows of G ``(n_g, d)``, in
+    the free variables, with a zero multiplier at these bounds.
     """
     sizes = np.linalg.norm(G, axis=-1, keepdims=True)
     G, implied = G / np.where(sizes > 0, sizes, 1), np.zeros_like(held)

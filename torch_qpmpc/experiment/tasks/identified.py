@@ -47,7 +47,7 @@ class Start(NamedTuple):
 
     The observation of ``log`` is the state of ``model``: where the plant is ``observed``, the
     estimate by its filter; ``order`` is as in `fit_state_space`. ``cut`` is the number of the log's
-    episodes that blow up. ``held`` is an action ``(n_u,)`` that the policy holds, by a cost of its
+    episodes that blow up. ``action`` ``(n_u,)`` is what the policy holds, by a cost of its
     own. ``choice`` is the table of starts that it was chosen from, ``blended`` the QP's schedule.
     ``riccati`` is True if the cost of x_N is the regulator's. ``found`` is the identified model
     with the outputs of the log.
@@ -60,7 +60,7 @@ class Start(NamedTuple):
     observed: bool = False
     cost: StageCost | None = None
     cut: int = 0
-    held: Tensor | None = None
+    action: Tensor | None = None
     choice: Choice | None = None
     blended: BlendedModel | None = None
     riccati: bool = False
@@ -150,7 +150,7 @@ def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
             cost = regulator_cost(cost, start, scheme.gamma)
     model, layout = _scheme_model(start.model), start.layout
     scheme = replace(scheme, layout=layout, model=model, cost=cost)
-    return scheme if start.held is None else _holding(scheme, start)
+    return scheme if start.action is None else _holding(scheme, start)
 
 
 def _scheme_model(model: Innovations) -> Model:
@@ -177,23 +177,23 @@ def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
 
 
 def _holding(scheme: Scheme, start: Start) -> Scheme:
-    """Return the scheme of the same model whose policy holds ``start.held``.
+    """Return the scheme of the same model whose policy holds ``start.action``.
 
-    Its cost is 1/2 (u_k - held)'R(u_k - held) in each stage, of the size of the log's costs, and a
-    constant, their mean: a weight of x would move the actions, and some plants react to any.
+    Its cost is 1/2 (u_k - action)'R(u_k - action) in each stage, of the size of the log's costs,
+    and a constant, their mean: a weight of x would move the actions, and some plants react to any.
     """
-    held, log, layout = start.held, start.log, scheme.layout
-    assert held is not None
+    action, log, layout = start.action, start.log, scheme.layout
+    assert action is not None
     valid = valid_steps(log)
     reward = log.get(("next", "reward"), torch.zeros(()))  # a task with a weight needs none
     costs = -reward.double().reshape(log.shape)[valid] if reward.ndim else reward.double()
-    size = (log["action"][valid].double() - held).abs().amax(0)
+    size = (log["action"][valid].double() - action).abs().amax(0)
     R = (costs.abs().mean() if costs.any() else 1.0) / size.square()
     gamma, N, zero = scheme.gamma, layout.horizon, R.new_zeros(layout.n_x)
-    q = torch.cat((R.new_zeros(layout.n_preview), layout.stages(zero, -R * held)))
+    q = torch.cat((R.new_zeros(layout.n_preview), layout.stages(zero, -R * action)))
     ahead = (gamma ** torch.arange(N, dtype=torch.float64)).sum()
     c = costs.mean() * (N if gamma == 1 else 1 / (1 - gamma))
-    c += ahead * (R * held.square()).sum() / 2
+    c += ahead * (R * action.square()).sum() / 2
     weight = torch.cat((zero, R))
     weight = weight if scheme.cost.hessian == "diagonal" else torch.diag(weight)
     weight = weight.expand_as(scheme.cost.stage_weight)  # one per stage where the scheme has that

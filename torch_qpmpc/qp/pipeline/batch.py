@@ -57,14 +57,9 @@ MATRICES = (0, 3, 5)
 class Prepared:
     """Theta, and the results that depend on it alone, each computed when first needed.
 
-    Args:
-        theta: the data, as NumPy arrays.
-        group: the index of each QP's matrices among the M, ``(B,)``; zeros if theta is shared.
-        n_kept: the number of leading entries of z that the elimination of C z = b keeps. V and Q
-            that keep the same entries share one elimination.
-        device: the device for tensors; None for NumPy arrays.
-        elimination: the elimination of C z = b; by default that of
-            `torch_qpmpc.qp.pipeline.condensing.eliminate`.
+    ``group`` ``(B,)`` is the index of each QP's matrices among the M, zero if theta is shared. The
+    elimination of C z = b, by default `condensing.eliminate`, keeps ``n_kept`` leading entries of
+    z: V and Q that keep the same ones share it. Without a ``device`` there are NumPy arrays.
     """
 
     def __init__(

@@ -219,12 +219,12 @@ def _steepest_recession(qp: _FreeQP, C_range: _Range) -> np.ndarray:
     scale = np.abs(slope).max(initial=0.0)
     if not scale > 0:
         return np.zeros(len(qp.q))
-    most = np.where(np.isfinite(qp.ub), qp.w, 0.0) / scale
-    least = np.where(np.isfinite(qp.lb), -qp.w, 0.0) / scale
-    rows, slope = least < most, slope / scale
+    high = np.where(np.isfinite(qp.ub), qp.w, 0.0) / scale
+    low = np.where(np.isfinite(qp.lb), -qp.w, 0.0) / scale
+    rows, slope = low < high, slope / scale
     A = _product(qp.G[rows], F).T
     if rows.any():
-        bounds = least[rows], most[rows]
+        bounds = low[rows], high[rows]
         lam = scipy.optimize.lsq_linear(A, -slope, bounds, method="bvls", tol=1e-15).x
         slope = slope + A @ lam
     return -F @ slope

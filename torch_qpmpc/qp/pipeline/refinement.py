@@ -154,16 +154,16 @@ class _QP(NamedTuple):
         norm = np.abs(self.G[rows]).sum(-1)
         matrix = np.vstack((self.C, self.G[rows] / np.maximum(norm, TINY)[:, None]))[:, n_f:].T
         limit = self.w[rows] * norm
-        least = np.where(below[rows] >= -NEAR, -limit, 0)
-        most = np.where(above[rows] >= -NEAR, limit, 0)
+        low = np.where(below[rows] >= -NEAR, -limit, 0)
+        high = np.where(above[rows] >= -NEAR, limit, 0)
         free = np.full(n_c, np.inf)
-        bounds = np.concatenate((-free, least)), np.concatenate((free, most))
+        bounds = np.concatenate((-free, low)), np.concatenate((free, high))
         codes = codes.astype(np.int8)
         if not matrix.size or not np.isfinite(matrix).all() or not np.isfinite(slope).all():
             return codes
         best = scipy.optimize.lsq_linear(matrix, -slope[n_f:], bounds, method="bvls", tol=1e-15)
         lam = best.x[n_c:]
-        at_limit = (lam == least) | (lam == most)
+        at_limit = (lam == low) | (lam == high)
         codes[rows] = np.sign(lam) * np.where(at_limit, 2, 1)
         return codes
 

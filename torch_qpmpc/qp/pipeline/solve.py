@@ -179,13 +179,8 @@ def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None
 class AtRest:
     """QPs of a theta at rest, solved one after the other.
 
-    What that does not solve, or the certificate rejects, is solved as any other QP.
-
-    Args:
-        qp: one QP.
-        n_f: the number of fixed entries of z.
-        n_kept: see `Programs.of`.
-        solver: a backend's name.
+    What that does not solve, or the certificate rejects, is solved as any other QP. ``n_f`` is the
+    number of fixed entries of z, ``n_kept`` that of `Programs.of`.
     """
 
     def __init__(self, qp: QuadraticProgram, n_f: int, n_kept: int, solver: str) -> None:
@@ -277,10 +272,7 @@ def _unconstrained(qps: SoftQPs) -> BackendSolution:
 def solve_programs(programs: Programs, solver: str, start: Array | None = None) -> BatchSolution:
     """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
-    Args:
-        programs: the QPs.
-        solver: a backend's name, see `torch_qpmpc.qp.solvers`.
-        start: active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`.
+    ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`.
     """
     began = time.perf_counter()
     log = _active_log.get(unused := SolveLog())
