@@ -66,11 +66,11 @@ LAYERS = {
 BUDGET = {
     ".": 377,
     "analysis": 1027,
-    "control": 4361,
+    "control": 4496,
     "envs": 1445,
     "experiment": 3350,
     "export": 1445,
-    "learning": 2768,
+    "learning": 2807,
     "mpc": 5120,
     "proofs": 1003,
     "qp": 5893,

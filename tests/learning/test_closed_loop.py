@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -45,7 +47,7 @@ def found() -> Identified:
 def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
     """It goes through the filter and the QP, and through loops with active and violated bounds."""
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), members=3)
+    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=3)
 
     def cost() -> torch.Tensor:
         seen, costs = _Loops(plant, 6, 1).run(mpc, 12)
@@ -73,7 +75,7 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
 def test_an_identified_plant_has_the_moments_of_its_model(found):
     """The first outputs and the later innovations have the model's covariances."""
     model = found.model
-    plant = simulated_plant(found, lambda p, u: p.sum(-1), members=1)
+    plant = simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
     rng, zero = torch.Generator().manual_seed(0), torch.zeros(4000, 1).double()
     s = plant.starts(rng, 4000)
     first = model.C @ model.P0 @ model.C.T + model.S
@@ -116,7 +118,7 @@ def test_what_is_no_better_leaves_theta_as_it_was():
 
 def test_loops_go_on_where_the_last_window_ended(found):
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), members=1)
+    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=1)
     whole, parts = _Loops(plant, 4, 3), _Loops(plant, 4, 3)
     with torch.no_grad():
         expected = whole.run(mpc, 10)[1]
@@ -170,16 +172,33 @@ def test_improve_refuses_an_mpc_that_learns_nothing():
         qm.improve(mpc, plant)
 
 
-def test_improve_refuses_a_model_with_known_signals():
-    rng = np.random.default_rng(0)
-    u, d, y = rng.uniform(-1, 1, 60), rng.uniform(-1, 1, 60), np.zeros(61)
-    for k in range(60):
-        y[k + 1] = 0.8 * y[k] + 0.5 * u[k] + d[k]
-    table = {"y": y[:-1], "u": u, "load": d}
-    found = identify(qm.read_log(table, outputs=["y"], inputs=["u"], known=["load"]))
-    mpc = qm.QPMPC.of(**{**found.arguments, "horizon": 3}, stage_weight=[1.0, 0.1])
-    with pytest.raises(QPError, match="plant: got a model with load, expected one without known"):
-        qm.improve(mpc, found)
+@pytest.mark.parametrize("learn", [("C", "b"), ("H", "q")])
+def test_known_signals_go_on_as_in_the_log(learn):
+    """From random steps, to the end of their trajectory; the MPC sees N steps of them."""
+    rng, logs = np.random.default_rng(0), []
+    for steps in (60, 40):
+        u, d, y = rng.uniform(-1, 1, (steps, 1)), rng.normal(size=(steps, 1)), np.zeros((1, 1))
+        for k in range(steps):
+            y = np.vstack((y, 0.8 * y[-1] + 0.5 * u[k] + d[k] + 0.1 * rng.normal(size=1)))
+        logs.append({"y": y[:-1, 0], "u": u[:, 0], "load": d[:, 0]})
+    tables = [qm.read_log(x, outputs=["y"], inputs=["u"], known=["load"]) for x in logs]
+    log = dataclasses.replace(tables[0], trajectories=[x.trajectories[0] for x in tables])
+    found = identify(log, order=0)
+    options = {"stage_weight": torch.tensor([3.0, 0.1]), "structure": "tied", "gamma": 1.0}
+    mpc = qm.QPMPC.of(**{**found.arguments, "horizon": 3}, **options, learn=learn, solver="daqp")
+    plant = simulated_plant(found, stage_cost(mpc.scheme), 3, members=2)
+    draw, d = torch.Generator().manual_seed(0), torch.cat([x.d for x in log.trajectories])[:, 0]
+    s, u = plant.starts(draw, 50), torch.zeros(50, 1).double()
+    for _ in range(70):
+        p, row = plant.known(s), plant._row(s, 3)
+        assert torch.equal(p[:, :4], d[row])
+        before, last = row[:, 0], torch.where(row[:, 0] < 59, 58, 97)
+        s = plant.step(s, u, plant.draw(draw, 50))
+        assert torch.equal(plant._row(s)[:, 0], torch.minimum(before + 1, last))
+        e = (plant.known(s)[:, 4] - 0.8 * p[:, 4] - p[:, 0]).std()
+        assert 0.05 < e < 0.2
+    report = qm.improve(mpc, found, updates=4, loops=8, steps=20, held_out=32, members=2)
+    assert np.isfinite([report.before, report.after, *report.curve]).all()
 
 
 def heavy(rng, size):
@@ -210,7 +229,7 @@ def test_simulated_noise_grows_as_the_logs():
                 0.8 * x[-1] + u[k] * (1 + 1.2 * rng.normal(size=1)) + 0.02 * rng.normal(size=1)
             )
         logs.append({"y": np.array(x), "u": u})
-    plant = simulated_plant(identify(logs, order=0), lambda p, u: p.sum(-1), members=1)
+    plant = simulated_plant(identify(logs, order=0), lambda p, u: p.sum(-1), 5, members=1)
     draw = torch.Generator().manual_seed(0)
     s = plant.starts(draw, 4000)
     for level in (0.0, 0.5, 1.0):

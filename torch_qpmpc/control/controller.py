@@ -13,13 +13,14 @@ import torch
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.exporting import ControllerExport, export_controller
 from torch_qpmpc.control.law import Law, Memory, Outcome
-from torch_qpmpc.control.learning import LearningReport, learn
+from torch_qpmpc.control.learning import LearningReport, improve, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, read_measured, read_row
 from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.learning.closed_loop import Improvement
 
 if TYPE_CHECKING:
     from torch_qpmpc.proofs import Answer
@@ -344,6 +345,26 @@ class Controller:
         if report.accepted:
             self._law = candidate
             self._start(self._memory._replace(e=None))
+        return report
+
+    def improve(self, log: Any, r: Any = None, spread: Any = None, **options: Any) -> Improvement:
+        """Move the MPC's theta along the gradient of the cost of simulated closed loops.
+
+        It is `torch_qpmpc.improve` for this controller: its observer, target and bounds act in
+        loops of a model that is identified from the log, with its noise. `Run.costs` is the cost.
+        If held-out loops cost less, the new theta is kept; estimates and last input stay.
+
+        Args:
+            log: a log of its signals, as `read_log` reads it. Loops start at its steps, from where
+                its known signals go on.
+            r, spread: set-points, as in `learn` for a log.
+            options: others of `torch_qpmpc.improve` than ``cost``.
+
+        Raises:
+            QPError: an argument is invalid, the log determines no model, or the MPC learns nothing.
+        """
+        report, law = improve(self._law.renewed(), self._memory, log, r, spread, **options)
+        self._law = law if report.kept else self._law
         return report
 
     def review(

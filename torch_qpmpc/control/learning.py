@@ -3,10 +3,14 @@
 The candidate is the controller with a state-space model that is identified from the transitions,
 in its observer, its target and its plan. Its weights, bounds and names are the same. Paired loops,
 with the same set-points and noise for both, decide (`torch_qpmpc.learning.gate.PairedTest`).
+
+`Controller.improve`: theta by gradients through closed loops of a log's model, as
+`torch_qpmpc.learning.closed_loop` has them for a `QPMPC`.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
@@ -27,8 +32,11 @@ from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlant, ensemble
+from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.identification import Identified, identify
+from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.log import STILL, Log, Trajectory, as_log, folds
 from torch_qpmpc.mpc.scheme import KEYWORDS
 
@@ -111,7 +119,7 @@ def learn(
         plant = _environment(law.design, source, middle, known, spread, steps)
         log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
     else:
-        log, held_out = _parts(as_log(source), law.design.plant)
+        log, held_out = _parts(_checked(as_log(source), law.design.plant))
         middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
         plant = _model(law.design, held_out, middle, spread, steps)
     model = _identified(log, law.design.plant)
@@ -147,9 +155,8 @@ def _environment(
 def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
     identified = _identified(held_out, design.plant)
-    y, d = (torch.cat(part).numpy() for part in list(zip(*held_out.trajectories, strict=True))[::2])
-    middle = np.clip(y.mean(0) if middle is None else middle, *design.y_bounds)
-    size = _sizes(design, spread, y.std(0))
+    d = torch.cat([one.d for one in held_out.trajectories]).numpy()
+    middle, size = _set_points(design, held_out, middle, spread)
     noise = np.sqrt(np.diag(identified.model.S))
 
     model = _state_space(identified, design)
@@ -170,6 +177,13 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
         return {"known": known, "r": levels, "noise": noise, **rest}
 
     return Plant("a model of the log's last third", model, options)
+
+
+def _set_points(design: Design, log: Log, middle: Any, spread: Any) -> tuple[Array, Array]:
+    """Return the middle of the set-points and their distances from it, by default the log's."""
+    y = torch.cat([one.y for one in log.trajectories]).numpy()
+    middle = np.clip(np.nanmean(y, 0) if middle is None else middle, *design.y_bounds)
+    return middle, _sizes(design, spread, np.nanstd(y, 0))
 
 
 def _sizes(design: Design, spread: Any, default: Array) -> Array:
@@ -206,8 +220,8 @@ def _run(law: Law, memory: Memory, plant: Plant, steps: int, entropy: tuple[int,
     return simulate(law, memory, plant.plant, steps, seed=seed, **plant.options(rng))
 
 
-def _parts(log: Log, plant: StateSpace) -> tuple[Log, Log]:
-    """Return the beginning of a log and the part that is held out."""
+def _checked(log: Log, plant: StateSpace) -> Log:
+    """Return a log of a plant's signals at its sampling time."""
     for kind in ("outputs", "inputs", "known"):
         got, want = getattr(log, kind), getattr(plant, kind)
         if got != want:
@@ -216,6 +230,11 @@ def _parts(log: Log, plant: StateSpace) -> tuple[Log, Log]:
     if log.dt and plant.dt and not np.isclose(log.dt, plant.dt):
         got, want = f"one step every {log.dt:g}", f"the controller's sampling time, {plant.dt:g}"
         raise QPError.expected("log", got, want, "Resample the log.")
+    return log
+
+
+def _parts(log: Log) -> tuple[Log, Log]:
+    """Return the beginning of a log and the part that is held out."""
     *parts, held_out = folds(log.trajectories, PARTS)
     first = [trajectory for part in parts for trajectory in part]
     return replace(log, trajectories=first), replace(log, trajectories=held_out)
@@ -270,3 +289,98 @@ def _compare(
         if test.decision != "open" or hopeless:
             break
     return test, costs
+
+
+def improve(
+    law: Law, memory: Memory, source: Any, r: Any, spread: Any, **options: Any
+) -> tuple[Improvement, Law]:
+    """Return the report and the law with the new theta; see `Controller.improve`."""
+    members, seed = options.pop("members", MEMBERS), options.get("seed", 0)
+    check_whole("members", members, 1)
+    check_seed(seed)
+    log = _checked(as_log(source), law.design.plant)
+    middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
+    set_points = _set_points(law.design, log, middle, spread)
+    models = ensemble(_identified(log, law.design.plant), members, seed)
+    law = replace(law, mpc=copy.deepcopy(law.mpc))
+    return descend(law.mpc, ControlledPlant(law, models, log, *set_points), **options), law
+
+
+class ControlledPlant(SimulatedPlant):
+    """Models under a law's observer and target, whose policy sees the p of its plan.
+
+    The state goes on with [u_last, r, u_s, p], and actions are relative to u_s. Loops start at the
+    log's steps. Set-points are within ``size`` of ``middle``, each held for half a horizon.
+    """
+
+    def __init__(
+        self, law: Law, models: list[Innovations], log: Log, middle: Array, size: Array
+    ) -> None:
+        y, u, d = (x[0].nan_to_num().numpy() for x in log.trajectories[0])
+        own = law.observer  # whose gain is the steady one, as its estimates in the log are
+        ends = own.L, np.eye(len(own.H)), own.at_rest(u, d, y), np.zeros_like(own.F)
+        observer = Innovations(own.F, own.G, own.E, own.offset, own.H, *ends)
+        super().__init__(models, observer, log.trajectories, self.cost, law.design.horizon)
+        self._mpc, self._design, self._from_log = law.mpc, law.design, True
+        for mpc in filter(None, (law.mpc.targets, law.mpc.free)):
+            mpc.on_failure = "mask"
+        self._levels = [*map(torch.as_tensor, (middle, size, *law.design.y_bounds))]
+        m, n_y = len(law.design.R), len(middle)
+        self._ends = [sum(self._sizes), m, n_y, m, law.mpc.n_p]
+
+    def starts(self, rng: torch.Generator, count: int) -> Tensor:
+        s = super().starts(rng, count)
+        row = self._row(s)[:, 0]
+        return self._planned(
+            s, self._u[(row - 1).maximum(self._first[row])], self._aims(rng, count)
+        )
+
+    def draw(self, rng: torch.Generator, count: int) -> Tensor:
+        return torch.cat((super().draw(rng, count), self._aims(rng, count)), -1)
+
+    def known(self, s: Tensor) -> Tensor:
+        return s.split(self._ends, -1)[-1]
+
+    def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
+        (base, _, r, *_), (e, aims) = s.split(self._ends, -1), nu.split(self._sizes[2], -1)
+        u = self._input(s, a)
+        base = super().step(base, u, e)
+        moves = base[:, -2:-1].detach() % max(self._horizon // 2, 1) == 0
+        return self._planned(base, u, torch.where(moves, aims, r))
+
+    def cost(self, s: Tensor, a: Tensor) -> Tensor:
+        """Return `Run.costs` of a step, ``(count,)``."""
+        base, u_last, r, u_s, _ = s.split(self._ends, -1)
+        y, u, design, d = self._parts(base)[2], self._input(s, a), self._design, self._ahead(base)
+        parts = (y - r, design.Q), (u - u_s, design.R), (u - u_last, design.dR)
+        cost = sum(((x @ torch.as_tensor(W)) * x).sum(-1) for x, W in parts)
+        for name, price in design.linear.items():
+            known = isinstance(price, str)
+            level = d[:, 0, design.plant.known.index(price)] if known else price
+            cost = cost + level * u[:, design.plant.inputs.index(name)]
+        lower, upper = map(torch.as_tensor, design.bounds_at(d[:, 0].numpy())[0])
+        outside = (lower - y).relu() + (y - upper).relu()
+        prices = torch.where(outside > 0, torch.as_tensor(design.y_slack), 0.0)
+        return cost + (prices * outside).sum(-1)
+
+    def _aims(self, rng: torch.Generator, count: int) -> Tensor:
+        """Draw set-points ``(count, n_y)``."""
+        middle, size, lower, upper = self._levels
+        share = torch.rand(count, len(middle), generator=rng, dtype=middle.dtype)
+        return (middle + size * (2 * share - 1)).clamp(lower, upper)
+
+    def _input(self, s: Tensor, a: Tensor) -> Tensor:
+        """Return the input of an action, within its bounds."""
+        base, _, _, u_s, _ = s.split(self._ends, -1)
+        bounds = self._design.bounds_at(self._ahead(base)[:, 0].numpy())[1]
+        return torch.clamp(u_s + a, *map(torch.as_tensor, bounds))
+
+    def _planned(self, base: Tensor, u_last: Tensor, r: Tensor) -> Tensor:
+        """Return the states with the target and p of the next plan."""
+        x, w = self._parts(base)[1].tensor_split([len(self._design.plant.A)], -1)
+        known, preview = self._ahead(base, self._horizon), self._design.references == "preview"
+        level = known.mean(1)
+        loads = [v[:, None].expand(-1, known.shape[1], -1) if preview else v for v in (r, w, level)]
+        target = self._mpc.target(*loads)
+        p = self._mpc.arrange(x, target, u_last=u_last, known=known, level=level)
+        return torch.cat((base, u_last, r, target.u[:, -1] if preview else target.u, p), -1)

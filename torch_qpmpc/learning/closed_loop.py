@@ -45,13 +45,16 @@ MEMBERS = 8
 class SimulatedPlant:
     """Identified models as a plant whose policy sees the estimate of a filter.
 
-    Loop i runs with model i modulo their number. The state is [xi, xi_f, k]: the model's own
-    estimate, which its innovations move, that of the filter, and the step, by which the gains vary.
-    The innovations are drawn from those of the log, scaled to the model's covariance and its
-    `growth` with the state and the action.
+    Loop i runs with model i modulo their number. The state is [xi, xi_f, y, k, first]: the model's
+    own estimate, which its innovations move, that of the filter, the output, the step, by which the
+    gains vary, and the row of known signals at step zero. The innovations are drawn from those of
+    the log, scaled to the model's covariance and its `growth` with the state and the action.
 
-    ``observer`` is the model of the filter, and ``cost`` maps estimates ``(count, n)`` and actions
-    ``(count, n_u)`` to costs ``(count,)``.
+    Loops start as the log's trajectories did or, with known signals, at its steps, from the
+    estimates there; the signals go on as logged, and hold their last row.
+
+    ``observer`` is the model of the filter, and ``cost`` maps p ``(count, n_p)`` and actions
+    ``(count, n_u)`` to costs ``(count,)``. p has the known signals of ``horizon`` steps ahead.
     """
 
     def __init__(
@@ -60,23 +63,50 @@ class SimulatedPlant:
         observer: Innovations,
         log: Sequence[Trajectory],
         cost: Callable[[Tensor, Tensor], Tensor],
+        horizon: int = 0,
     ) -> None:
         self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
         noises = zip(*(_noise(model, log) for model in models), strict=True)
         self._residuals, self._growth = map(torch.stack, noises)
-        self._n = self._own.A.shape[-1]
+        self._horizon, n_y = horizon, self._residuals.shape[-1]
+        self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
+        steps = torch.tensor([one.steps for one in log])
+        self._first = (steps.cumsum(0) - steps).repeat_interleave(steps)
+        self._last = (steps.cumsum(0) - 1).repeat_interleave(steps)
+        self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
+        self._seen = _stacked([_estimates(model, log) for model in (*models, observer)])
+        self._y = torch.cat([x.y[:-1] for x in log])
+        self._from_log = self._d.shape[1] > 0
 
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw states ``(count, n_s)`` after the first output."""
-        k = torch.zeros(count, dtype=torch.int64)
-        x = self._own.x0[torch.arange(count) % len(self._own.x0)]
-        seen = self._filter.x0.expand(count, -1)
-        e = torch.randn(count, self._residuals.shape[-1], generator=rng, dtype=x.dtype)
-        return self._measured(x, seen, self._own.at("roots", e, k), k)
+        one = torch.arange(count) % len(self._own.x0)
+        if self._from_log:
+            row = torch.randint(len(self._d), (count,), generator=rng)
+            x, seen = self._seen[one, row, : self._sizes[0]], self._seen[-1, row, : self._sizes[1]]
+            y = torch.where(self._y[row].isfinite(), self._y[row], self._own.at("C", x))
+            k = torch.stack((row - self._first[row], self._first[row]), -1)
+            return torch.cat((x, seen, y, k.to(x)), -1)
+        k, seen = torch.zeros(count, dtype=torch.int64), self._filter.x0.expand(count, -1)
+        x = self._own.x0[one]
+        e = torch.randn(count, self._sizes[2], generator=rng, dtype=x.dtype)
+        return self._measured(x, seen, self._own.at("roots", e, k), k, k)
 
     def known(self, s: Tensor) -> Tensor:
-        """Return what the policy sees, ``(count, n)``."""
-        return s[:, self._n : -1]
+        """Return what the policy sees, p ``(count, n_p)``."""
+        return torch.cat((self._ahead(s, self._horizon).flatten(1), self._parts(s)[1]), -1)
+
+    def _parts(self, s: Tensor) -> tuple[Tensor, ...]:
+        return s.split(self._sizes, -1)
+
+    def _row(self, s: Tensor, ahead: int = 0) -> Tensor:
+        """Return the rows of the log's signals now and ``ahead``, ``(count, ahead + 1)``."""
+        k, first = s.detach()[:, -2:].long().split(1, -1)
+        return (first + k + torch.arange(ahead + 1)).minimum(self._last[first])
+
+    def _ahead(self, s: Tensor, ahead: int = 0) -> Tensor:
+        """Return the known signals now and ``ahead``, ``(count, ahead + 1, n_d)``."""
+        return self._d[self._row(s, ahead)]
 
     def draw(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw innovations of unit covariance, ``(count, n_y)``."""
@@ -90,22 +120,24 @@ class SimulatedPlant:
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """Return the next states."""
-        own, k, x = self._own, s[:, -1].detach().long() + 1, s[:, : self._n]
+        own, (x, seen, *_), d = self._own, self._parts(s), self._ahead(s)[:, 0]
+        k, first = s.detach()[:, -2:].long().unbind(-1)
         squares = torch.cat((x.new_ones(len(x), 1), x.square(), a.square()), -1)
         growth = self._growth[torch.arange(len(x)) % len(self._growth)]
-        e = own.at("roots", nu, k) * (growth @ squares[..., None])[..., 0].sqrt()
-        return self._measured(own.moved(x, a), self._filter.moved(self.known(s), a), e, k)
+        e = own.at("roots", nu, k + 1) * (growth @ squares[..., None])[..., 0].sqrt()
+        return self._measured(own.moved(x, a, d), self._filter.moved(seen, a, d), e, k + 1, first)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return the costs of a step, ``(count,)``."""
         return self._cost(self.known(s), a)
 
-    def _measured(self, x: Tensor, seen: Tensor, e: Tensor, k: Tensor) -> Tensor:
+    def _measured(self, x: Tensor, seen: Tensor, e: Tensor, k: Tensor, first: Tensor) -> Tensor:
         """Return the states after an output, from their predictions."""
         own, other = self._own, self._filter
-        error = own.at("C", x) + e - other.at("C", seen)
-        x, seen = x + own.at("gains", e, k), seen + other.at("gains", error, k)
-        return torch.cat((x, seen, k[:, None].to(x)), -1)
+        y = own.at("C", x) + e
+        x = x + own.at("gains", e, k)
+        seen = seen + other.at("gains", y - other.at("C", seen), k)
+        return torch.cat((x, seen, y, k[:, None].to(x), first[:, None].to(x)), -1)
 
 
 class _Course:
@@ -115,8 +147,9 @@ class _Course:
     """
 
     def __init__(self, models: Sequence[Innovations]) -> None:
-        parts = ([getattr(x, name) for x in models] for name in ("A", "B", "offset", "C", "x0"))
-        self.A, self.B, self.offset, self.C, self.x0 = map(_stacked, parts)
+        names = ("A", "B", "E", "offset", "C", "x0")
+        parts = ([getattr(x, name) for x in models] for name in names)
+        self.A, self.B, self.E, self.offset, self.C, self.x0 = map(_stacked, parts)
         courses = [[*model.settling(STEPS), (model.L, model.S)] for model in models]
         longest = max(map(len, courses))
         courses = [course + course[-1:] * (longest - len(course)) for course in courses]
@@ -130,10 +163,10 @@ class _Course:
         chosen = whole[one] if k is None else whole[one, k.clamp(max=whole.shape[1] - 1)]
         return (chosen @ x[..., None])[..., 0]
 
-    def moved(self, x: Tensor, u: Tensor) -> Tensor:
+    def moved(self, x: Tensor, u: Tensor, d: Tensor) -> Tensor:
         """Return the predictions of the next states."""
         offset = self.offset[torch.arange(len(x)) % len(self.offset)]
-        return self.at("A", x) + self.at("B", u) + offset
+        return self.at("A", x) + self.at("B", u) + self.at("E", d) + offset
 
 
 def _stacked(parts: Sequence[np.ndarray]) -> Tensor:
@@ -149,29 +182,34 @@ def _root(V: np.ndarray) -> np.ndarray:
 
 
 def simulated_plant(
-    identified: Identified, cost: Callable, members: int = MEMBERS, seed: int = 0
+    identified: Identified, cost: Callable, horizon: int, members: int = MEMBERS, seed: int = 0
 ) -> SimulatedPlant:
-    """Return the model and those of bootstrapped trajectories as a plant, with its filter.
+    """Return the `ensemble` of a model as a plant, with its filter; see `SimulatedPlant`."""
+    models, log = ensemble(identified, members, seed), identified.log.trajectories
+    return SimulatedPlant(models, models[0], log, cost, horizon)
 
-    Raises:
-        QPError: the model has known signals.
-    """
-    if known := identified.log.known:
-        got, want = f"a model with {', '.join(known)}", "one without known signals"
-        raise QPError.expected("plant", got, want, "Simulate them in a plant of your own.")
+
+def ensemble(identified: Identified, members: int, seed: int) -> list[Innovations]:
+    """Return a model and those of trajectories of its log drawn with replacement."""
     log, fit = identified.log.trajectories, identified.fit
     rng, models = np.random.default_rng(seed), [fit.model]
     for _ in range(members - 1 if len(log) > 1 else 0):
         again = [log[i] for i in rng.integers(len(log), size=len(log))]
         models.append(fit_state_space(again, fit.order, fit.lags).model)
-    return SimulatedPlant(models, fit.model, log, cost)
+    return models
+
+
+def _estimates(model: Innovations, log: Sequence[Trajectory]) -> np.ndarray:
+    """Return the model's estimates in the steps of a log, ``(steps, n)``."""
+    parts = ((x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in log)
+    return np.concatenate([model.estimates(*part)[:-1] for part in parts])
 
 
 def _noise(model: Innovations, log: Sequence[Trajectory]) -> tuple[Tensor, Tensor]:
     """Return the log's innovations in unit covariance, and the `growth` of their variances."""
     parts = [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in log]
     e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
-    v = np.concatenate([np.hstack((model.estimates(*part)[:-1], part[1])) for part in parts])
+    v = np.hstack((_estimates(model, log), np.concatenate([u for _, u, _ in parts])))
     seen = np.isfinite(e).all(1)
     e, v = e[seen] - e[seen].mean(0), v[seen]
     c = growth(e, v)
@@ -357,7 +395,8 @@ def improve(
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
     if isinstance(plant, Identified):
-        plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), members, seed)
+        cost = cost or stage_cost(mpc.scheme)
+        plant = simulated_plant(plant, cost, mpc.horizon, members, seed)
     if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
         got = f"{type(plant).__name__}, without {', '.join(missing)}"
         raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")

@@ -71,7 +71,7 @@ class Start(NamedTuple):
         assert self.found is not None
         known = isinstance(physics, LinearSystem)
         cost = physics.cost if known else stage_cost(scheme)
-        return simulated_plant(self.found, cost, cfg.optimizer.members, cfg.seed)
+        return simulated_plant(self.found, cost, self.horizon, cfg.optimizer.members, cfg.seed)
 
     @property
     def observer(self) -> Innovations | None:

@@ -1,0 +1,164 @@
+"""`Controller.improve`: its gradient, its cost, what it gains, and what it refuses."""
+
+from __future__ import annotations
+
+import copy
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+import torch_qpmpc as qm
+from torch_qpmpc import QPError
+from torch_qpmpc.control import learning
+from torch_qpmpc.control.simulation import Run
+from torch_qpmpc.learning.closed_loop import _Loops, ensemble
+from torch_qpmpc.mpc.log import Log
+
+LEARN = ("H", "H_f", "q", "b", "C", "lb", "ub")
+CASES = {
+    "bounds": {"y_bounds": (19.0, 21.0)},
+    "prices": {"linear": {"q": "price"}, "dR": 0.5, "du_bounds": (-2.0, 2.0)},
+    "limits": {"y_bounds": {"T": (None, "top")}, "dR": 0.5},
+    "preview": {"references": "preview", "R": 0.1, "y_bounds": (19.0, 21.0)},
+    "blocks": {"blocks": [1, 2, 2], "dR": 0.5, "disturbances": None},
+}
+
+
+@functools.cache
+def logged() -> Log:
+    """Return a noisy tank's signals with a known load, a price and a limit."""
+    rng, T, q = np.random.default_rng(0), np.full(400, 20.0), rng_levels()
+    d, price = 5 * np.sin(np.arange(400) / 9), 1 + np.sin(np.arange(400) / 5)
+    for k in range(399):
+        T[k + 1] = 20 + 0.8 * (T[k] - 20) + 0.2 * (q[k] - 5) + 0.05 * d[k] + 0.3 * rng.normal()
+    signals = {"T": T, "q": q, "d": d, "price": price, "top": 21 + 0.3 * np.cos(np.arange(400) / 7)}
+    return qm.read_log(signals, outputs=["T"], inputs=["q"], known=["d", "price", "top"])
+
+
+def rng_levels() -> np.ndarray:
+    return np.random.default_rng(1).uniform(0, 10, 100).repeat(4)
+
+
+@functools.cache
+def model():
+    """Return the log's model, on which the price and the limit do not act."""
+    return qm.identify(logged(), order=1)
+
+
+def made(case: str, learn=LEARN) -> qm.Controller:
+    plant = model().model
+    E = plant.E * [1.0, 0.0, 0.0]
+    names = {"outputs": ["T"], "inputs": ["q"], "known": ["d", "price", "top"], "E": E}
+    options = {"Q": 1.0, "u_bounds": (0.0, 10.0), **names, **CASES[case]}
+    mpc = qm.LinearMPC((plant.A, plant.B, plant.C), 5, **options, learn=learn)
+    return qm.Controller(mpc)
+
+
+def loops(controller: qm.Controller) -> learning.ControlledPlant:
+    models, middle, size = ensemble(model(), 1, 0), np.array([20.3]), np.array([0.6])
+    return learning.ControlledPlant(controller._law, models, logged(), middle, size)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_gradient_is_that_of_finite_differences(case):
+    """Through the observer, the target and the QP, along structured and random directions."""
+    controller = made(case)
+    mpc, plant = controller.mpc, loops(controller)
+
+    def cost() -> torch.Tensor:
+        return _Loops(plant, 4, 1).run(mpc, 8)[1].mean()
+
+    cost().backward()
+    generator, moved = torch.Generator().manual_seed(2), set()
+    for name, leaf in mpc.coordinates().items():
+        if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:
+            continue
+        noise = torch.randn(leaf.shape, generator=generator).double()
+        for direction in (leaf.detach().clone(), noise * leaf.detach().abs()):
+            direction = direction.nan_to_num(posinf=0.0, neginf=0.0)
+            if not (size := direction.norm()) > 0:
+                continue
+            direction, step, ends = direction / size, 1e-5, []
+            with torch.no_grad():
+                for sign in (1, -1):
+                    leaf.add_(sign * step * direction)
+                    ends.append(cost())
+                    leaf.sub_(sign * step * direction)
+            expected = (ends[0] - ends[1]) / (2 * step)
+            got = (leaf.grad * direction).nan_to_num().sum()
+            torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5, msg=name)
+            moved |= {name} if abs(got) > 1e-3 else set()
+    assert len(moved) >= 3
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_loops_are_the_controllers_own(case):
+    """The controller's steps have the same inputs, and `Run.costs` the same costs."""
+    controller = made(case)
+    plant, law = loops(controller), controller._law
+    draw = torch.Generator().manual_seed(3)
+    s = plant.starts(draw, 3)
+    with torch.no_grad():
+        for _ in range(6):
+            base, u_last, r, u_s, p = s.split(plant._ends, -1)
+            _, e, y, *_ = plant._parts(base)
+            a = controller.mpc.policy(p)
+            u, costs = u_s + a, plant.cost(s, a)
+            ahead = plant._ahead(base, 5).numpy()
+            for i in range(3):
+                begun = law.begun(u_last[i].numpy())
+                begun = begun._replace(e=e[i].numpy())
+                rows = np.tile(r[i].numpy(), (6, 1))
+                seen = law.observer.H @ e[i].numpy()  # which corrects nothing
+                move = law.step(begun, seen, rows, ahead[i])
+                np.testing.assert_allclose(move.u, u[i], rtol=1e-6, atol=1e-6)
+                one = (y[i : i + 1], r[i : i + 1], u[i : i + 1])
+                ys, rs, us = (x.numpy() for x in one)
+                both = np.vstack((ys, ys)), np.vstack((rs, rs))
+                run = Run(law.design, *both, us, ahead[i][:1], u_s[i : i + 1].numpy(), begun.u)
+                np.testing.assert_allclose(run.cost[0], costs[i], rtol=1e-6, atol=1e-6)
+            s = plant.step(s, a, plant.draw(draw, 3))
+
+
+def test_it_stays_away_from_a_bound_that_noise_violates():
+    controller = made("bounds", learn=("H", "H_f", "q", "b"))
+    controller.reset(y={"T": 20.0}, u={"q": 5.0}, known={"d": 0.0, "price": 1.0, "top": 21.0})
+    before, u = copy.deepcopy(controller.mpc.state_dict()), controller.u
+    options = {"r": [20.9], "spread": 0.2, "updates": 12, "loops": 16, "steps": 25, "held_out": 64}
+    report = controller.improve(logged(), **options)
+    assert report.kept
+    assert report.after < 0.9 * report.before
+    assert len(report.curve) == 12
+    assert not all(torch.equal(before[k], x) for k, x in controller.mpc.state_dict().items())
+    assert np.array_equal(controller.u, u)
+    now = {"d": 0.0, "price": 1.0, "top": 21.0}
+    assert 0 <= controller.step(y={"T": 20.5}, r={"T": 20.9}, known=now)["q"] <= 10
+
+
+def test_what_is_no_better_leaves_the_controller_as_it_was():
+    controller = made("blocks")
+    mpc = controller.mpc
+    report = controller.improve(logged(), updates=1, loops=2, steps=5, held_out=16, rate=1e-9)
+    assert not report.kept
+    assert controller.mpc is mpc
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"members": 0}, "members: got 0"),
+        ({"seed": -1}, "seed: got -1"),
+        ({"updates": 0}, "updates: got 0"),
+        ({"spread": 0.0}, r"spread: got \[0.0\], expected distances >= 0"),
+        ({"log": {"y": np.zeros(9), "u": np.zeros(9)}}, "log: got outputs"),
+        ({"learn": ()}, "mpc: got one that learns nothing"),
+    ],
+)
+def test_improve_refuses(change, message):
+    controller = made("bounds", learn=change.pop("learn", LEARN))
+    log = change.pop("log", None)
+    log = logged() if log is None else qm.read_log(log, outputs=["y"], inputs=["u"])
+    with pytest.raises(QPError, match=message):
+        controller.improve(log, **change)
