@@ -40,7 +40,7 @@ from torch_qpmpc.mpc.validation import (
     check_one_model,
     check_pair,
     learned_entries,
-    without_gradients,
+    ungraded,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE, AtRest
@@ -327,7 +327,6 @@ class QPMPC(nn.Module):
                 return torch.from_numpy(u)
         return self._action(self._solve(s, qp, warm_start), s.dtype)
 
-    @without_gradients
     def predict(self, observation: Any) -> np.ndarray:
         """Return pi(observation) as an array, without gradients: the action to apply, and no more.
 
@@ -347,7 +346,7 @@ class QPMPC(nn.Module):
             >>> mpc.predict(np.ones((4, 1))).shape
             (4, 1)
         """
-        if isinstance(observation, Tensor):
+        if isinstance(ungraded("observation", observation), Tensor):
             observation = observation.detach().cpu()
         try:
             x = np.asarray(observation)
@@ -362,8 +361,9 @@ class QPMPC(nn.Module):
             raise QPError.expected("observation", "NaN or inf", "finite numbers")
         if x.size == self.n_p and (u := self._action_at_rest(x, warm=True)) is not None:
             return u
-        s = torch.as_tensor(x).to(self.C_0.device)
-        return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
+        with torch.no_grad():
+            s = torch.as_tensor(x).to(self.C_0.device)
+            return self._action(self._solve(s, None, on_failure="raise"), s.dtype).cpu().numpy()
 
     def forward(
         self, s: Tensor, a: Tensor | None = None, qp: QuadraticProgram | None = None

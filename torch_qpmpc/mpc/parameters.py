@@ -187,7 +187,8 @@ class Leaves:
         self._states, self._contents = [(x, x.data_ptr(), x._version) for x in tensors], []
         for x in tensors if self.known else ():
             if id(x) not in large:
-                own = x.detach().reshape(-1).numpy().view(np.uint8)
+                words = np.uint8 if x.nbytes % 8 else np.uint64
+                own = x.detach().reshape(-1).numpy().view(words)
                 self._contents.append((own, own.copy()))
 
     def unchanged(self, module: nn.Module) -> bool:

@@ -83,8 +83,8 @@ larger: Any = intrinsic(_larger)
 
 @compiled
 def equal(x, y):
-    """Return True if all bytes of two arrays are equal."""
-    difference = np.uint8(0)
+    """Return True if two arrays of bytes, or of words, are equal."""
+    difference = y.dtype.type(0)
     for j in range(len(y)):
         difference |= x[j] ^ y[j]
     return difference == 0
