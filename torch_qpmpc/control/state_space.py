@@ -212,8 +212,9 @@ def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> 
 
 
 def _numbers(name: str, value: Any) -> Array:
-    """Return `read_numbers` as an array, which numbers and arrays of float64 are at once."""
-    if isinstance(value, float) or getattr(value, "dtype", None) == np.float64:
+    """Return `read_numbers` as an array, which floats and arrays of float64 are at once."""
+    of_floats = isinstance(value, list) and all(type(x) is float for x in value)
+    if of_floats or isinstance(value, float) or getattr(value, "dtype", None) == np.float64:
         return np.asarray(value)
     return read_numbers(name, value).detach().numpy()
 
