@@ -38,7 +38,6 @@ from torch_qpmpc.experiment.algorithms import (
     make_run_replay,
     warm_up_batches,
 )
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, save_checkpoint
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
@@ -52,7 +51,7 @@ from torch_qpmpc.experiment.metrics import (
     update_metrics,
 )
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.run_folder import RunFolder, export_run
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, export_run, save_checkpoint
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics

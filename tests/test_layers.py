@@ -68,13 +68,13 @@ BUDGET = {
     "analysis": 1027,
     "control": 4497,
     "envs": 1445,
-    "experiment": 3350,
-    "export": 1445,
+    "experiment": 3319,
+    "export": 1444,
     "learning": 2807,
     "mpc": 5121,
-    "proofs": 1003,
+    "proofs": 999,
     "qp": 5893,
-    "study": 548,
+    "study": 547,
 }
 #: Libraries that only some layers may import.
 RESERVED = {

@@ -19,8 +19,8 @@ from omegaconf import DictConfig, OmegaConf
 import train
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPMPC, QPError, export_c
-from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.config import settings
+from torch_qpmpc.experiment.run_folder import load_checkpoint
 from torch_qpmpc.experiment.start import stored_log
 from torch_qpmpc.export.__main__ import main as export
 from torch_qpmpc.files import labelled, write_whole

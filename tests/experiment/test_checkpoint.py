@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.run_folder import load_checkpoint, save_checkpoint
 
 
 @pytest.fixture

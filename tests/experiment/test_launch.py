@@ -21,8 +21,8 @@ from tests.runs import CONFIGS, SMALL, choices, make_config
 from tests.stops import assert_same_numbers, go_on
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import evaluation
-from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.launch import LOCK, Interrupt, launched, locked
+from torch_qpmpc.experiment.run_folder import load_checkpoint
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 

@@ -16,7 +16,7 @@ import train
 from tests.runs import SMALL, make_config
 from tests.stops import assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.checkpoint import load_checkpoint, save_checkpoint
+from torch_qpmpc.experiment.run_folder import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.run_state import resumed
 
 #: The stop is at neither an evaluation nor a row of metrics, and an episode ends after it.

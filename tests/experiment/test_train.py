@@ -24,9 +24,8 @@ from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import PointMassGymEnv
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.checkpoint import load_checkpoint
 from torch_qpmpc.experiment.launch import LOCK, locked
-from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.run_folder import load_checkpoint, read_metrics
 from torch_qpmpc.experiment.tasks import make_physics
 from torch_qpmpc.mpc.layout import Layout, band_distance
 

@@ -13,7 +13,7 @@ import train
 from tests.runs import SMALL, make_config
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, GaussNewton
-from torch_qpmpc.experiment.checkpoint import load_checkpoint
+from torch_qpmpc.experiment.run_folder import load_checkpoint
 from torch_qpmpc.learning.updates import first_order
 
 #: Factors of a thousand and more by which the rates are too large.

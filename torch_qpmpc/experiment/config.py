@@ -167,50 +167,33 @@ class Config(Group):
         raise QPError.expected(key, repr(value), expected, remedy)
 
     @model_validator(mode="after")
-    def constraints_fit_the_penalties(self) -> Self:
-        part = self.constraint
+    def values_fit(self) -> Self:
+        part, tied = self.constraint, self.constraint.structure != "free"
         if not part.learn and not self.task.learn_cost:
             self.conflict("task.learn_cost", "something to learn, here or in constraint.learn")
         if (part.deviation or part.si) and "C" not in part.learn:
             remedy = "Set the penalty to null, or learn C."
             self.conflict("constraint.learn", "a list with C, because a penalty on C is on", remedy)
-        if part.structure == "free":
-            return self
-        if part.deviation:
+        if tied and part.deviation:
             remedy = "A tied C has nothing off its band to penalise."
             self.conflict("constraint.structure", "free", remedy)
-        if part.si and self.optimizer.name == "gauss_newton":
+        if tied and part.si and self.optimizer.name == "gauss_newton":
             remedy = "gauss_newton needs a free C for constraint.si."
             self.conflict("constraint.structure", "free", remedy)
-        if "G" in part.learn:
+        if tied and "G" in part.learn:
             self.conflict("constraint.learn", "no G", "No task has mixed constraints to learn.")
-        return self
-
-    @model_validator(mode="after")
-    def closed_loops_have_a_model(self) -> Self:
         if self.optimizer.name == "closed_loop" and self.start.name != "data":
             remedy = "closed_loop needs the model of a log: add start=data."
             self.conflict("optimizer.name", "another one with start=model", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def replay_has_the_windows(self) -> Self:
-        """Check that windows of the horizon's length fit the episodes, in the replay."""
         if self.replay_capacity % self.num_envs:
             self.conflict("replay_capacity", f"a multiple of num_envs = {self.num_envs}")
-        if self.constraint.si is None:
-            return self
-        if (self.task.episode_steps or self.task.horizon) < self.task.horizon:
+        if part.si and (self.task.episode_steps or self.task.horizon) < self.task.horizon:
             remedy = "constraint.si needs windows of task.horizon steps."
             expected = f"at least task.horizon = {self.task.horizon}"
             self.conflict("task.episode_steps", expected, remedy)
-        if not self.replay:
+        if part.si and not self.replay:
             remedy = "constraint.si samples from the replay; constraint=deviation has no si."
             self.conflict("replay", "true", remedy)
-        return self
-
-    @model_validator(mode="after")
-    def task_has_noise_and_rivals(self) -> Self:
         if self.task.name not in TASKS:  # its script has not run
             return self
         task = find_task(self.task.model_dump())

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
-from torch_qpmpc.experiment.checkpoint import BEST
+from torch_qpmpc.experiment.run_folder import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import in_closed_loop

@@ -20,7 +20,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import (
     check_config,
     differences,
@@ -29,7 +28,7 @@ from torch_qpmpc.experiment.config import (
     settings,
     unknown_key,
 )
-from torch_qpmpc.experiment.run_folder import read_summary, unwritable
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, load_checkpoint, read_summary, unwritable
 from torch_qpmpc.experiment.run_state import (
     check_fresh,
     check_own_folder,

@@ -21,10 +21,10 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, load_checkpoint
 from torch_qpmpc.experiment.tasks.code import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import labelled
 from torch_qpmpc.learning.replay import Replay

@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import CHECKPOINT, learned_qp
-from torch_qpmpc.experiment.run_folder import C_FOLDER
+from torch_qpmpc.experiment.run_folder import C_FOLDER, CHECKPOINT, learned_qp
 from torch_qpmpc.export.export import STORAGES, export_c
 from torch_qpmpc.export.writer import REAL
 

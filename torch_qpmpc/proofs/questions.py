@@ -128,22 +128,18 @@ def invariance(
     plant: Plant | Sequence[Plant],
     states: Polytope,
     *,
-    into: Polytope | None = None,
     steps: int = 1,
     seconds: float = 60.0,
 ) -> Answer:
     """Prove that p is in the set again after ``steps`` steps, or find a p that leaves it.
 
-    ``into`` is another set to be in then, such as a smaller one, for contraction. The answer's
-    value is the distance from the worst facet. The other arguments and errors are those of
+    The answer's value is the distance from the worst facet. Arguments and errors are those of
     `largest_violation`.
     """
     check_states(mpc, states)
-    into = states if into is None else into
-    check_states(mpc, into)
-    length = np.linalg.norm(into.A, axis=1)
+    length = np.linalg.norm(states.A, axis=1)
     question = f"outside the set after {steps} step{'s' * (steps > 1)}"
-    A, b = into.A / length[:, None], into.b / length
+    A, b = states.A / length[:, None], states.b / length
     return _worst(question, mpc, plant, states, A, b, steps, seconds)
 
 

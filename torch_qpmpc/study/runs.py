@@ -26,9 +26,8 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.checkpoint import learned_qp
 from torch_qpmpc.experiment.config import check_config, load_config, settings
-from torch_qpmpc.experiment.run_folder import NUMBERS, read_metrics, read_summary
+from torch_qpmpc.experiment.run_folder import NUMBERS, learned_qp, read_metrics, read_summary
 from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.code import has_run
