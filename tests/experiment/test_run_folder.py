@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
-from tests.runs import SMALL, make_config, run_command
+from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.run_folder import RunFolder, read_metrics, unwritable
 
@@ -134,15 +134,6 @@ def test_a_failed_write_is_reported(tmp_path):
     (tmp_path / "checkpoint.pt").touch()
     with pytest.raises(QPError, match=f"free space, then python train.py resume={tmp_path}.$"):
         raise unwritable(tmp_path, error)
-
-
-@pytest.mark.parametrize("mode", [("run",), ("sweep", "-m")], ids=lambda mode: mode[0])
-def test_a_folder_that_cannot_be_made_ends_in_a_sentence(tmp_path, mode):
-    key, *multirun = mode
-    (tmp_path / "file").touch()
-    sentence = rf"^folder: got .* failed \(.*Not a directory.*with hydra\.{key}\.dir=FOLDER\.$"
-    with pytest.raises(SystemExit, match=sentence):
-        run_command(*multirun, f"hydra.{key}.dir={tmp_path}/file/run")
 
 
 @pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json"])

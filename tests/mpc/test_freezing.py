@@ -188,13 +188,6 @@ def test_a_state_dict_of_other_frozen_entries_is_refused():
         masked(entries()).load_state_dict(masked(rows()).state_dict())
 
 
-def test_a_state_dict_from_before_is_loaded():
-    mpc, other = random_mpc(0), random_mpc(0, free=0.0)
-    state = {name: x for name, x in mpc.state_dict().items() if name != "_extra_state"}
-    other.load_state_dict(state)
-    assert torch.equal(other.C, mpc.C)
-
-
 def test_arguments_are_kept_by_value():
     A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
     options = {"learn": {"C": mask}, "stage_weight": [1.0, 1.0, 0.1]}
