@@ -16,6 +16,18 @@ def unravel_keys(key: Any) -> tuple[str, ...]:
     return (key,) if isinstance(key, str) else key
 
 
+def test_keys_that_are_renamed_late_reach_the_estimator():
+    loss = QPQLearningLoss(make_operator({"state_value_key": "value_2"}))  # it writes this key
+    loss.set_keys(value="value_2")
+    loss.make_value_estimator("td0")
+    names = ("advantage", "value_target", "reward", "done", "terminated")
+    loss.set_keys(**{name: f"{name}_2" for name in names})
+    keys = loss.value_estimator.tensor_keys
+    assert [getattr(keys, name) for name in names] == [f"{name}_2" for name in names]
+    assert ("next", "reward_2") in loss.in_keys
+    assert ("next", "reward") not in loss.in_keys
+
+
 RENAMED = {
     "observation": ("agent", "state"),
     "action": ("agent", "force"),
