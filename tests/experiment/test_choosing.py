@@ -190,7 +190,7 @@ def test_a_log_of_ones_own_is_the_first_one(tmp_path):
 def test_zero_action_is_held_if_nothing_costs_less(tmp_path):
     cfg, physics, start, choice = chosen(*HOPELESS)
     choice.write(tmp_path)
-    again = chosen_before(cfg, physics, start.log, tmp_path)
+    again: Any = chosen_before(cfg, physics, start.log, tmp_path)
     assert torch.equal(again.held, start.held)
     assert choice.name == start.summary["start"] == ZERO_ACTION
     assert choice.scheme != ZERO_ACTION
