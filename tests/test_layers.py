@@ -66,11 +66,11 @@ LAYERS = {
 BUDGET = {
     ".": 377,
     "analysis": 1027,
-    "control": 4497,
+    "control": 4500,
     "envs": 1445,
     "experiment": 3319,
     "export": 1444,
-    "learning": 2807,
+    "learning": 2810,
     "mpc": 5121,
     "proofs": 999,
     "qp": 5893,

@@ -355,8 +355,8 @@ class Controller:
         If held-out loops cost less, the new theta is kept; estimates and last input stay.
 
         Args:
-            log: a log of its signals, as `read_log` reads it. Loops start at its steps, from where
-                its known signals go on.
+            log: a log of its signals, as `read_log` reads it. Loops start at its steps within the
+                outputs' bounds, from where its known signals go on.
             r, spread: set-points, as in `learn` for a log.
             options: others of `torch_qpmpc.improve` than ``cost``.
 

@@ -310,7 +310,8 @@ class ControlledPlant(SimulatedPlant):
     """Models under a law's observer and target, whose policy sees the p of its plan.
 
     The state goes on with [u_last, r, u_s, p], and actions are relative to u_s. Loops start at the
-    log's steps. Set-points are within ``size`` of ``middle``, each held for half a horizon.
+    log's steps within the outputs' bounds, if there are any. Set-points are within ``size`` of
+    ``middle``, each held for half a horizon.
     """
 
     def __init__(
@@ -325,6 +326,8 @@ class ControlledPlant(SimulatedPlant):
         for mpc in filter(None, (law.mpc.targets, law.mpc.free)):
             mpc.on_failure = "mask"
         self._levels = [*map(torch.as_tensor, (middle, size, *law.design.y_bounds))]
+        inside = (self._y.clamp(*self._levels[2:]) == self._y).all(-1)
+        self._rows = self._rows[inside | ~inside.any()]
         m, n_y = len(law.design.R), len(middle)
         self._ends = [sum(self._sizes), m, n_y, m, law.mpc.n_p]
 

@@ -76,13 +76,14 @@ class SimulatedPlant:
         self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
         self._seen = _stacked([_estimates(model, log) for model in (*models, observer)])
         self._y = torch.cat([x.y[:-1] for x in log])
+        self._rows = torch.arange(len(self._d))  # where loops start, if from the log
         self._from_log = self._d.shape[1] > 0
 
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw states ``(count, n_s)`` after the first output."""
         one = torch.arange(count) % len(self._own.x0)
         if self._from_log:
-            row = torch.randint(len(self._d), (count,), generator=rng)
+            row = self._rows[torch.randint(len(self._rows), (count,), generator=rng)]
             x, seen = self._seen[one, row, : self._sizes[0]], self._seen[-1, row, : self._sizes[1]]
             y = torch.where(self._y[row].isfinite(), self._y[row], self._own.at("C", x))
             k = torch.stack((row - self._first[row], self._first[row]), -1)
@@ -106,7 +107,8 @@ class SimulatedPlant:
 
     def _ahead(self, s: Tensor, ahead: int = 0) -> Tensor:
         """Return the known signals now and ``ahead``, ``(count, ahead + 1, n_d)``."""
-        return self._d[self._row(s, ahead)]
+        n_d = self._d.shape[1]
+        return self._d[self._row(s, ahead)] if n_d else s.new_zeros(len(s), ahead + 1, 0)
 
     def draw(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw innovations of unit covariance, ``(count, n_y)``."""
@@ -166,7 +168,8 @@ class _Course:
     def moved(self, x: Tensor, u: Tensor, d: Tensor) -> Tensor:
         """Return the predictions of the next states."""
         offset = self.offset[torch.arange(len(x)) % len(self.offset)]
-        return self.at("A", x) + self.at("B", u) + self.at("E", d) + offset
+        x = self.at("A", x) + self.at("B", u) + offset
+        return x + self.at("E", d) if d.shape[1] else x
 
 
 def _stacked(parts: Sequence[np.ndarray]) -> Tensor:
