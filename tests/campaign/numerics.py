@@ -33,7 +33,11 @@ NAMES = (
     "z",
     "value, float32",
     "z, float32",
-    *(f"gradient of {part}, {place} kinks" for part in ("value", "z") for place in KINDS),
+    *(
+        f"gradient of {part}, {place.replace('away', 'away from')} kinks"
+        for part in ("value", "z")
+        for place in KINDS
+    ),
 )
 
 

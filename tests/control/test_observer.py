@@ -79,9 +79,9 @@ def test_a_disturbance_drifts_within_the_horizon_by_the_noise_of_the_outputs():
     for kind, bound, reach in (("output", 2.0, 1.0), ("u1", 20.0, responses[0])):
         law = filtered(disturbances={"y1": kind}, u_bounds=(-bound, bound))._law
         assert np.allclose(law.noise, 0.2, rtol=1e-4)
-        assert np.allclose(law.drift, law.noise / reach / 8**0.5)
+        assert np.allclose(law.drift, law.noise / reach)
     law = filtered(disturbances={"y1": "u1"}, u_bounds=(-0.2, 0.2))._law
-    assert np.allclose(law.drift, 0.1 * 0.2 / 8**0.5), "at most a tenth of the input's range"
+    assert np.allclose(law.drift, 0.1 * 0.2), "at most a tenth of the input's range"
 
 
 def test_c_starts_from_the_same_states_and_settles_alike():

@@ -44,8 +44,8 @@ class Controller:
         noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
             default those of the identification. Without one, a tenth of half the distance of the
             outputs' bounds, or without bounds of the deviation that costs one, ``1 / sqrt(Q)``.
-        drift: standard deviations of the change of each disturbance in a step; by default those
-            with which it moves an output within the horizon by as much as the identified noise.
+        drift: standard deviations of the change of each disturbance in a step; by default what
+            moves an output within the horizon by its identified noise.
             Without one, a tenth of half the distance of the bounds of the output or the input. A
             larger ratio of drift to noise rejects disturbances faster and passes on more noise.
 

@@ -115,7 +115,7 @@ class Law:
         share = np.full(len(design.usual), SMALL)
         if design.plant.noise is not None:
             share = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual))) / design.usual
-            drifts = moving(design, share * design.usual) / design.horizon**0.5
+            drifts = moving(design, share * design.usual)
         else:
             drifts = np.full(len(w.names), SMALL) * design.of_w(design.usual)
         noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)
