@@ -56,7 +56,6 @@ def test_blocks_are_found():
         if fenced(text, "python")
     ],
 )
-@pytest.mark.usefixtures("rough_fits")
 def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     """Block after block, as a reader would paste them into one session."""
     monkeypatch.chdir(tmp_path)

@@ -266,7 +266,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
         "resume: got /nonexistent, which does not exist, expected a run",
         lambda: resumed("/nonexistent", []),
     ),
-    ("resume: got it together with seed=2, expected no other", lambda: resumed("/x", ["seed=2"])),
     ("resume: got None, expected a path.", lambda: resumed(None, [])),
 ]
 
