@@ -191,6 +191,7 @@ def test_zero_action_is_held_if_nothing_costs_less(tmp_path):
     cfg, physics, start, choice = chosen(*HOPELESS)
     choice.write(tmp_path)
     again: Any = chosen_before(cfg, physics, start.log, tmp_path)
+    assert start.action is not None
     assert torch.equal(again.action, start.action)
     assert choice.name == start.summary["start"] == ZERO_ACTION
     assert choice.scheme != ZERO_ACTION
