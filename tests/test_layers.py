@@ -66,7 +66,7 @@ LAYERS = {
 BUDGET = {
     ".": 377,
     "analysis": 1027,
-    "control": 4500,
+    "control": 4502,
     "envs": 1445,
     "experiment": 3319,
     "export": 1444,

@@ -79,6 +79,11 @@ def test_a_log_says_that_loops_start_off_rest(model):
     """Without one the filter takes such a start for a disturbance, also with the right model."""
     controller = made(model)
     assert controller.learn(Lag(start=3.0), **QUICK).accepted
+    u = controller.u
+    controller.step([1.0], [1.0])  # starts again, from rest
+    settled = controller.observer.at_rest(u, np.zeros(0), np.array([1.0]))
+    after = controller.observer.predicted(settled, controller.u, np.zeros(0))
+    assert np.allclose(np.concatenate((controller.x, controller.w)), after)
     assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
 
 

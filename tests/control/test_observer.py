@@ -71,6 +71,16 @@ def test_gains_end_where_they_are_steady_and_a_plant_at_rest_has_the_last_one():
     assert np.allclose(np.concatenate((controller.x, controller.w)), after)
 
 
+def test_estimates_go_on_with_the_steady_gain_after_more_steps_than_there_are_gains():
+    """As after learning a model that settles sooner."""
+    controller, other = filtered(), filtered()
+    for c, steps in ((controller, 1000), (other, len(other.observer.gains) - 1)):
+        c.step([2.0], [0.5])
+        c._memory = c._memory._replace(steps=steps)
+        c.step([1.5])
+    assert np.array_equal(controller.x, other.x)
+
+
 def test_a_disturbance_drifts_within_the_horizon_by_the_noise_of_the_outputs():
     x = responses = np.zeros(2)
     for _ in range(8):

@@ -45,9 +45,9 @@ class Controller:
             default those of the identification. Without one, a tenth of half the distance of the
             outputs' bounds, or without bounds of the deviation that costs one, ``1 / sqrt(Q)``.
         drift: standard deviations of the change of each disturbance in a step; by default what
-            moves an output within the horizon by its identified noise.
-            Without one, a tenth of half the distance of the bounds of the output or the input. A
-            larger ratio of drift to noise rejects disturbances faster and passes on more noise.
+            moves an output within the horizon by its identified noise. Without one, a tenth of half
+            the distance of the bounds of the output or the input. A larger ratio of drift to noise
+            rejects disturbances faster and passes on more noise.
 
     Attributes:
         mpc: the MPC.
@@ -344,7 +344,8 @@ class Controller:
         report, candidate = learn(law, self._memory, source, transitions, **options)
         if report.accepted:
             self._law = candidate
-            self._start(self._memory._replace(e=None))
+            steps = len(self._law.observer.gains) - 1  # from rest
+            self._start(self._memory._replace(e=None, steps=steps))
         return report
 
     def improve(self, log: Any, r: Any = None, spread: Any = None, **options: Any) -> Improvement:

@@ -234,7 +234,8 @@ class Law:
         observer, e = self.observer, memory.e
         if e is None and not (valid and seen.all()):
             return memory, None, Outcome.INVALID
-        k, last = memory.steps, len(observer.gains) - 1
+        last = len(observer.gains) - 1
+        k = min(memory.steps, last)  # another model, or a file of another machine, had more
         if e is None:
             e = observer.start if k < last else observer.at_rest(memory.u, known[0], y)
         e = e + observer.gains[k] @ np.where(seen, y - observer.H @ e, 0.0)

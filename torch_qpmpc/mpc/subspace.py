@@ -167,9 +167,9 @@ def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Arr
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
     states = []
     for (y, v), _ in _batches(_signals(trajectories)):
-        inputs = model.inputs(*np.split(v, [model.B.shape[1]], -1))
-        after = model.estimates(y, *np.split(v, [model.B.shape[1]], -1))[..., :-1, :]
-        states.append((after @ model.A.T + inputs).reshape(-1, len(model.A)))
+        u, d = np.split(v, [model.B.shape[1]], -1)
+        x = model.estimates(y, u, d)[..., :-1, :] @ model.A.T + model.inputs(u, d)
+        states.append(x.reshape(-1, len(model.A)))
     x = np.concatenate(states)
     return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
 
