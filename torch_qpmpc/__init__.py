@@ -6,30 +6,30 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.learning.closed_loop import improve
-from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
-from torch_qpmpc.mpc.blended import identify_blended
-from torch_qpmpc.mpc.bounds import Bounds
-from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.identification import identify
-from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import read_log
-from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.qp.pipeline.solve import SolveLog
-from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.solve import solve_qp
 
 if TYPE_CHECKING:
     from torch_qpmpc import envs as envs
     from torch_qpmpc.control.controller import Controller
     from torch_qpmpc.control.linear_mpc import LinearMPC
     from torch_qpmpc.export.export import CompiledPolicy, export_c
+    from torch_qpmpc.learning.closed_loop import improve
+    from torch_qpmpc.learning.gauss_newton import GaussNewton
     from torch_qpmpc.learning.operators import QPActorValueOperator
+    from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
+    from torch_qpmpc.mpc.blended import identify_blended
+    from torch_qpmpc.mpc.bounds import Bounds
+    from torch_qpmpc.mpc.cost import Cost
+    from torch_qpmpc.mpc.identification import identify
+    from torch_qpmpc.mpc.layout import Layout
+    from torch_qpmpc.mpc.log import read_log
+    from torch_qpmpc.mpc.model import Model
+    from torch_qpmpc.mpc.module import QPMPC
+    from torch_qpmpc.mpc.scheme import Scheme
+    from torch_qpmpc.qp.pipeline.solve import SolveLog
+    from torch_qpmpc.qp.program import QuadraticProgram, Status
+    from torch_qpmpc.qp.solve import solve_qp
     from torch_qpmpc.study.runs import load_run
 
 __all__ = [
@@ -65,17 +65,34 @@ __all__ = [
 __version__ = "0.1.0"
 
 if not TYPE_CHECKING:
-    #: Imported at first use: TensorDict and TorchRL take as long to import as torch does.
+    #: Imported at first use: Numba, TensorDict and TorchRL take as long to import as torch does.
     _LAZY = {
+        "Bounds": "torch_qpmpc.mpc.bounds:Bounds",
         "CompiledPolicy": "torch_qpmpc.export.export:CompiledPolicy",
         "Controller": "torch_qpmpc.control.controller:Controller",
-        "envs": "torch_qpmpc.envs:",
+        "Cost": "torch_qpmpc.mpc.cost:Cost",
+        "DeviationPenalty": "torch_qpmpc.learning.penalties:DeviationPenalty",
+        "GaussNewton": "torch_qpmpc.learning.gauss_newton:GaussNewton",
+        "Layout": "torch_qpmpc.mpc.layout:Layout",
         "LinearMPC": "torch_qpmpc.control.linear_mpc:LinearMPC",
+        "Model": "torch_qpmpc.mpc.model:Model",
         "QPActorValueOperator": "torch_qpmpc.learning.operators:QPActorValueOperator",
+        "QPMPC": "torch_qpmpc.mpc.module:QPMPC",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
+        "QuadraticProgram": "torch_qpmpc.qp.program:QuadraticProgram",
+        "Scheme": "torch_qpmpc.mpc.scheme:Scheme",
+        "SolveLog": "torch_qpmpc.qp.pipeline.solve:SolveLog",
+        "Status": "torch_qpmpc.qp.program:Status",
+        "SystemIdentificationPenalty": "torch_qpmpc.learning.penalties:SystemIdentificationPenalty",
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
+        "envs": "torch_qpmpc.envs:",
         "export_c": "torch_qpmpc.export.export:export_c",
+        "identify": "torch_qpmpc.mpc.identification:identify",
+        "identify_blended": "torch_qpmpc.mpc.blended:identify_blended",
+        "improve": "torch_qpmpc.learning.closed_loop:improve",
         "load_run": "torch_qpmpc.study.runs:load_run",
+        "read_log": "torch_qpmpc.mpc.log:read_log",
+        "solve_qp": "torch_qpmpc.qp.solve:solve_qp",
     }
 
     def __getattr__(name: str) -> Any:
