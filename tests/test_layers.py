@@ -64,7 +64,7 @@ LAYERS = {
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
-    ".": 377,
+    ".": 394,
     "analysis": 1027,
     "control": 4502,
     "envs": 1445,
