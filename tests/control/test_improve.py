@@ -68,9 +68,9 @@ def test_its_gradient_is_that_of_finite_differences(case):
     mpc, plant = controller.mpc, loops(controller)
 
     def cost() -> torch.Tensor:
-        return _Loops(plant, 4, 1).run(mpc, 8)[1].mean()
+        return _Loops(plant, 4, 1).run(mpc, 8).costs.mean()
 
-    cost().backward()
+    _Loops(plant, 4, 1).mean_cost(mpc, 8).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
     for name, leaf in mpc.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:

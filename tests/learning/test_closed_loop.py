@@ -50,13 +50,15 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
     plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=3)
 
     def cost() -> torch.Tensor:
-        seen, costs = _Loops(plant, 6, 1).run(mpc, 12)
-        at_bounds = (seen[..., 2].abs() > 0.4999).double().mean()
+        taken = _Loops(plant, 6, 1).run(mpc, 12)
+        at_bounds = (taken.actions.abs() > 0.4999).double().mean()
         assert 0.1 < at_bounds < 0.9
-        assert (seen[..., 0] < -0.2).any()
-        return costs.mean()
+        assert (taken.known[..., 0] < -0.2).any()
+        return taken.costs.mean()
 
-    cost().backward()
+    mean = _Loops(plant, 6, 1).mean_cost(mpc, 12)
+    torch.testing.assert_close(mean.detach(), cost(), rtol=0.0, atol=0.0)
+    mean.backward()
     for name, leaf in mpc.coordinates().items():
         if leaf.grad is None:
             continue
@@ -120,9 +122,8 @@ def test_loops_go_on_where_the_last_window_ended(found):
     mpc = controller(found)
     plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=1)
     whole, parts = _Loops(plant, 4, 3), _Loops(plant, 4, 3)
-    with torch.no_grad():
-        expected = whole.run(mpc, 10)[1]
-        got = torch.cat([parts.run(mpc, 5)[1] for _ in range(2)])
+    expected = whole.run(mpc, 10).costs
+    got = torch.cat([parts.run(mpc, 5).costs for _ in range(2)])
     torch.testing.assert_close(got, expected)
 
 

@@ -13,7 +13,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # imports its parts at their first use
@@ -273,6 +273,17 @@ def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
     return cost
 
 
+class _Steps(NamedTuple):
+    """Steps of closed loops, each ``(steps, count, ..)``."""
+
+    states: Tensor
+    known: Tensor
+    actions: Tensor
+    active: Tensor
+    noise: Tensor
+    costs: Tensor
+
+
 class _Loops:
     """Closed loops with a plant, side by side, that can go on."""
 
@@ -288,19 +299,49 @@ class _Loops:
         self._s, self.done = self._plant.starts(self._rng, self._count), 0
         self._nu = torch.zeros_like(self._s)
 
-    def run(self, mpc: QPMPC, steps: int) -> tuple[Tensor, Tensor]:
-        """Return [p; u] of the next steps ``(steps, count, n_p + n_u)``, and their costs."""
-        plant, s, seen, costs = self._plant, self._s.detach(), [], []
+    @torch.no_grad()
+    def run(self, mpc: QPMPC, steps: int) -> _Steps:
+        """Return the next steps."""
+        plant, s, done = self._plant, self._s, []
         qp, active = mpc.quadratic_program(), None
         for _ in range(steps):
             p = self._known(s)
             a, active = mpc.policy_and_active_set(p, active, qp)
-            seen.append(torch.cat((p, a), -1).detach())
-            costs.append(plant.cost(s, a))
             self._nu = plant.noise(self._nu, plant.draw(self._rng, self._count))
+            done.append(_Steps(s, p, a, active, self._nu, plant.cost(s, a)))
             s = plant.step(s, a, self._nu)
         self._s, self.done = s, self.done + steps
-        return torch.stack(seen), torch.stack(costs)
+        return _Steps(*map(torch.stack, zip(*done, strict=True)))
+
+    def mean_cost(self, mpc: QPMPC, steps: int) -> Tensor:
+        """Return the mean cost of the next steps, with its gradient in theta if it is finite.
+
+        Theta acts on the loops by their actions alone. The chain through the plant goes backwards
+        in time and gives each action the slope of the mean cost in it; all QPs are differentiated
+        at once.
+        """
+        taken = self.run(mpc, steps)
+        mean = taken.costs.mean()
+        if not mean.isfinite():
+            return mean
+        known = taken.known.requires_grad_()
+        actions = mpc.policy(known, taken.active)
+        rows = (
+            torch.autograd.grad(u.sum(), known, retain_graph=True)[0] for u in actions.unbind(-1)
+        )
+        gains = torch.stack([*rows], -2)
+        share, slope = torch.full_like(taken.costs[0], 1 / taken.costs.numel()), self._s * 0
+        slopes = torch.empty_like(taken.actions)
+        for k in range(steps - 1, -1, -1):
+            s, a = taken.states[k].requires_grad_(), taken.actions[k].requires_grad_()
+            ends = self._plant.cost(s, a), self._plant.step(s, a, taken.noise[k])
+            direct, slopes[k] = torch.autograd.grad(
+                ends, (s, a), (share, slope), materialize_grads=True
+            )
+            through = (slopes[k][:, None] @ gains[k])[:, 0]
+            slope = direct + torch.autograd.grad(self._known(s), s, through)[0]
+        linear = (actions * slopes).sum()
+        return mean + linear - linear.detach()
 
 
 @dataclass(frozen=True)
@@ -406,9 +447,8 @@ def improve(
     seeds = [int(x) for x in np.random.SeedSequence(seed).generate_state(2)]
     before, on_failure = copy.deepcopy(mpc.state_dict()), mpc.on_failure
 
-    @torch.no_grad()
     def tried() -> Tensor:
-        return _Loops(plant, held_out, seeds[0]).run(mpc, steps)[1].mean(0)
+        return _Loops(plant, held_out, seeds[0]).run(mpc, steps).costs.mean(0)
 
     mpc.on_failure, curve = "mask", []
     try:
@@ -458,8 +498,8 @@ class Descent:
         if not leaves:
             remedy = "Name parts of theta in its learn."
             raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
-        with torch.no_grad():
-            seen = self._loops.run(mpc, steps)[0].flatten(0, 1)
+        taken = self._loops.run(mpc, steps)
+        seen = torch.cat((taken.known, taken.actions), -1).flatten(0, 1)
         sizes = seen[seen.isfinite().all(1)].square().mean(0).sqrt()
         x, u, d = sizes[mpc.n_p - mpc.n_x : mpc.n_p], sizes[mpc.n_p :], sizes[: mpc.n_d]
         z = torch.cat((x, u, d))[mpc.layout.signals()]
@@ -482,7 +522,7 @@ class Descent:
         A cost or gradient that is not finite moves nothing. ``penalty`` is as in `improve`.
         """
         self._mpc.zero_grad()
-        mean = self._loops.run(self._mpc, self._window)[1].mean()
+        mean = self._loops.mean_cost(self._mpc, self._window)
         if mean.isfinite():
             loss = mean if penalty is None else mean + penalty(self._mpc)
             (loss / abs(mean.detach())).backward()
