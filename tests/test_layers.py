@@ -70,7 +70,7 @@ BUDGET = {
     "envs": 1445,
     "experiment": 3319,
     "export": 1444,
-    "learning": 2810,
+    "learning": 2850,
     "mpc": 5121,
     "proofs": 999,
     "qp": 5893,
