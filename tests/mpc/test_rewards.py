@@ -38,21 +38,30 @@ def test_the_cost_of_the_rewards_is_found():
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_cost_of_the_next_state_becomes_one_of_the_present_by_the_model():
+@pytest.mark.parametrize("signal", ["state", "output"])
+@pytest.mark.parametrize("size", [1.0, 1000.0])
+def test_a_cost_of_the_next_signals_becomes_one_of_the_present_by_the_model(signal, size):
+    """However little of the rewards' variance the noise explains."""
     draw = torch.Generator().manual_seed(0)
     A, B = torch.tensor([[0.9, 0.2], [0.0, 0.7]]).double(), torch.tensor([[0.1], [1.0]]).double()
-    x, u = (torch.randn(300, n, generator=draw, dtype=torch.float64) for n in (2, 1))
-    e, L = 0.3 * torch.randn(300, 2, generator=draw, dtype=torch.float64), torch.eye(2).double()
-    following = x @ A.mT + u @ B.mT + 0.5 + e @ L.mT
-    v = torch.cat((following, u), -1)
+    L = (
+        torch.eye(2).double()
+        if signal == "state"
+        else torch.diag(torch.tensor([0.4, 0.2])).double()
+    )
+    x, u = (size * torch.randn(300, n, generator=draw, dtype=torch.float64) for n in (2, 1))
+    e = 0.3 * torch.randn(300, 2, generator=draw, dtype=torch.float64)
+    predicted = x @ A.mT + u @ B.mT + 0.5
+    v = torch.cat((predicted + e, u), -1)
     reward = -((v @ W * v).sum(-1) / 2 + v @ Q_LINEAR + 3.0).unsqueeze(-1)
-    after = {"observation": following, "reward": reward}
+    after = {"observation": predicted + e @ L.mT, "measured": predicted + e, "reward": reward}
     data = TensorDict({"observation": x, "action": u, "next": after}, [300])
-    parts = (A, B, torch.zeros(2, 0), torch.full((2,), 0.5), L, L, 0.09 * L, torch.zeros(2), L)
+    C = torch.eye(2).double()
+    parts = (A, B, torch.zeros(2, 0), torch.full((2,), 0.5), C, L, 0.09 * C, torch.zeros(2), C)
     model = Innovations(*(part.double().numpy() for part in parts))
     fitted = fit_rewards(data, LAYOUT, model=model)
-    assert pytest.approx(1) == fitted.R2
-    v = torch.cat((x @ A.mT + u @ B.mT + 0.5, u), -1)
+    assert pytest.approx(1, abs=1e-12) == fitted.R2
+    v = torch.cat((predicted, u), -1)
     expected = (v @ W * v).sum(-1) / 2 + v @ Q_LINEAR + 3.0 + 0.09 * W[:2, :2].trace() / 2
     assert_close(fitted(torch.cat((x, u), -1)), expected)
 

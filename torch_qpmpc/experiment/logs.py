@@ -9,7 +9,7 @@ from tensordict import TensorDictBase, pad
 
 from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import NEXT, cuts, valid_steps
+from torch_qpmpc.mpc.log import MEASURED, NEXT, cuts, valid_steps
 
 #: The largest size of an observation, relative to the largest in the first transitions.
 GROWTH = 1e6
@@ -57,7 +57,7 @@ def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
 def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:
     """Return a log, ``(T,)`` or ``(episodes, T)``, with estimates in the place of its outputs.
 
-    They begin anew where a trajectory of `as_log` does.
+    They begin anew where a trajectory of `as_log` does. The next outputs are in `MEASURED`.
     """
     rows = log if log.batch_dims == 2 else log.unsqueeze(0)
     y, following, u = (rows[key].double() for key in ("observation", NEXT, "action"))
@@ -72,4 +72,5 @@ def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:
         x = torch.where(ends[:, k, None], first[:, (k + 1) % y.shape[1]], after)
         step = torch.where(ends[:, k], 0, step + 1)
     now, after = (torch.stack(part, 1).reshape(*log.shape, -1) for part in zip(*pairs, strict=True))
-    return log.clone(recurse=False).set("observation", now).set(NEXT, after)
+    own = {"observation": now, NEXT: after, MEASURED: log[NEXT]}
+    return log.clone(recurse=False).update(own)

@@ -40,6 +40,8 @@ KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a Tensor
 #: A column's header with its unit, as in ``T [degC]``.
 HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
 NEXT = ("next", "observation")
+#: The next outputs, where the observations are estimates.
+MEASURED = ("next", "measured")
 REMEDY = "Pass logged steps as TorchRL's collectors and rollouts return them."
 #: Flags of a step that ends its trajectory.
 ENDS = (("next", "done"), ("next", "terminated"), ("next", "truncated"))

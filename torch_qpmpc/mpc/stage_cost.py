@@ -14,7 +14,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import LARGEST, NEXT, logs, valid_steps
+from torch_qpmpc.mpc.log import LARGEST, MEASURED, NEXT, logs, valid_steps
 from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.validation import ungraded
 
@@ -254,8 +254,9 @@ REMEDY = (
     "Pass stage_weight (in train.py task.stage_weight), the weight W of the cost "
     "1/2 [x; u]' W [x; u], such as [1.0, 1.0, 0.1] for two states and an action."
 )
-#: The least R2 without a warning, and the gain in R2 that is worth a cost of the next state.
-GOOD, GAIN = 0.9, 1e-3
+#: The least R2 without a warning; and the share of the unexplained variance that a cost of the next
+#: state or outputs may leave.
+GOOD, LEFT = 0.9, 0.5
 
 
 def fit_rewards(
@@ -263,31 +264,39 @@ def fit_rewards(
 ) -> StageCost:
     """Fit the stage cost of (d_k, x_k, u_k) to the rewards of a log, as `fit_stage_cost`.
 
-    Many plants reward the next state. With a ``model`` a cost of (x_{k+1}, u_k) is fitted, too: if
-    it explains more, it is returned as the cost of (x_k, u_k) that the model makes of it, but not
-    for a ``diagonal`` W or with known signals. An R2 below 0.9 is warned of.
+    Many plants reward the next state or its outputs. With a ``model`` costs of (x_{k+1}, u_k) and,
+    of estimates, (y_{k+1}, u_k) are fitted, too: one that leaves less than half of the variance
+    unexplained is returned as the cost of (x_k, u_k) that the model makes of it, but not for a
+    ``diagonal`` W or with known signals. An R2 below 0.9 is warned of.
     """
     parts = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    x, u, following, cost = map(torch.cat, parts)
+    x, u, following, measured, cost = map(torch.cat, parts)
     fitted = fit_stage_cost(torch.cat((x, u), -1), cost, layout.n_d, diagonal)
     if model is not None and not diagonal and not layout.n_d:
-        after = fit_stage_cost(torch.cat((following, u), -1), cost)
-        if after.R2 > fitted.R2 + GAIN:
-            fitted = _before(after, model)
+        L, S, C = map(torch.tensor, (model.L, model.S, model.C))
+        nexts = [(following, torch.eye(layout.n_x).to(C), L @ S @ L.mT)]
+        nexts += [(measured, C, S)] if measured.shape[1] else []
+        for following, C, noise in nexts:
+            after = fit_stage_cost(torch.cat((following, u), -1), cost)
+            if 1 - after.R2 < LEFT * (1 - fitted.R2):
+                fitted = _before(after, model, C, noise)
     if not fitted.R2 >= GOOD:
         warnings.warn(poor(fitted.R2), UserWarning, stacklevel=2)
     return fitted
 
 
-def _before(after: StageCost, model: Innovations) -> StageCost:
-    """Return the cost of (x_k, u_k) whose (x_{k+1}, u_k) has the cost ``after``, in the mean."""
-    (n, n_u), W = model.B.shape, after.W
-    A, B, _, offset, _, L, S = (torch.tensor(part) for part in model[:7])
-    M = torch.cat((torch.cat((A, B), -1), torch.eye(n + n_u).to(W)[n:]))
-    m = torch.nn.functional.pad(offset, (0, n_u))
-    noise = (W[:n, :n] * (L @ S @ L.mT)).sum() / 2
-    c = after.c + m @ W @ m / 2 + after.q @ m + noise
-    return StageCost(M.mT @ W @ M, M.mT @ (after.q + W @ m), c, after.R2)
+def _before(after: StageCost, model: Innovations, C: Tensor, noise: Tensor) -> StageCost:
+    """Return the cost of (x_k, u_k) whose (C x_{k+1}, u_k) has the cost ``after``, in the mean.
+
+    ``noise`` is the covariance of C x_{k+1} about its prediction.
+    """
+    (n, n_u), W, m = model.B.shape, after.W, len(C)
+    A, B, offset = map(torch.tensor, (model.A, model.B, model.offset))
+    M = torch.cat((C @ torch.cat((A, B), -1), torch.eye(n + n_u).to(W)[n:]))
+    level = torch.nn.functional.pad(C @ offset, (0, n_u))
+    noise = (W[:m, :m] * noise).sum() / 2
+    c = after.c + level @ W @ level / 2 + after.q @ level + noise
+    return StageCost(M.mT @ W @ M, M.mT @ (after.q + W @ level), c, after.R2)
 
 
 def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -> Cost:
@@ -303,7 +312,7 @@ def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -
 
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
-    """Return [d; x], u, the next x and the costs of the steps that are not padding."""
+    """Return [d; x], u, the next x, the next y of estimates, and the costs, without padding."""
     reward = steps.get(("next", "reward"), None) if hasattr(steps, "batch_size") else None
     if reward is None:
         raise _unfitted("a log without rewards")
@@ -314,8 +323,10 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
     u = steps["action"]
     d = steps["preview"][..., : layout.n_d] if layout.n_d else u[..., :0]
     x, following = (steps[key][..., -layout.n_x :] for key in ("observation", NEXT))
-    d, x, u, following = (part.detach().cpu().double()[kept] for part in (d, x, u, following))
-    return torch.cat((d, x), -1), u, following, -reward
+    measured = steps.get(MEASURED, u[..., :0])
+    parts = (d, x, u, following, measured)
+    d, x, u, following, measured = (part.detach().cpu().double()[kept] for part in parts)
+    return torch.cat((d, x), -1), u, following, measured, -reward
 
 
 def poor(R2: float) -> str:
