@@ -3,8 +3,10 @@
     python -m tests.benchmarks.guide --seeds 6 7 8 9 10 --write
 
 A log of 4,000 random actions, `identify`, and `Controller` with its defaults and the plant's own
-weights. Beside it are the start of the Gymnasium route, two logs of 2,000 actions, and a reference
-that knows the plant. All are the mean of the 32 episodes of `tests.benchmarks.outside`.
+weights. Beside it are the start of the Gymnasium route, two logs of 2,000 actions, and two
+references that know the plant: one with these weights, and one with the plant's own cost, of which
+umv's has a product of an output and an input. All are the mean of the 32 episodes of
+`tests.benchmarks.outside`.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from torch_qpmpc.study.markdown import replaced, table
 HERE = "tests.benchmarks.guide"
 HORIZON, ACTIONS, EPISODES, DELAY = 20, 4_000, 32, 5
 DELAYED = "delay of five steps"
+HEAD = ["J of each log", "by the guide", "reference with its weights", "`start=data`", "reference"]
 #: The outputs' and inputs' weights of each plant.
 WEIGHTS: dict[str, dict[str, Any]] = {
     "controlgym umv": {"Q": {"y2": 1.0}, "R": {"u1": 1.0}},
@@ -134,9 +137,10 @@ def main() -> None:
             starts.append(float(row["start"]))
             known = float(row["reference"])
             print(name, seed, *map(significant, (own[-1], starts[-1], known)), flush=True)
-        cells = (", ".join(map(significant, x)) for x in (own, starts, [known]))
+        plain = outside.controlgym_lqg(name.split()[-1], False) if name != DELAYED else known
+        cells = (", ".join(map(significant, x)) for x in (own, [plain], starts, [known]))
         lines.append([name, *cells])
-    text = table(["J of each log", "by the guide", "`start=data`", "reference"], lines)
+    text = table(HEAD, lines)
     print(text)
     if options.write:
         page = outside.PAGE.read_text(encoding="utf-8")

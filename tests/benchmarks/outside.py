@@ -198,8 +198,10 @@ def pcgym_oracle(model: str) -> float:
     return J
 
 
-#: Points of the partial differential equations, so that an episode takes less than a second.
-SIZES = {id: {"n_state": 64} for id in ("convection_diffusion_reaction", "allen_cahn")}
+#: Points of the partial differential equations, so that an episode takes less than a second; and
+#: the limit of the actions where 1 is too little for the plant.
+SETTINGS = {id: {"n_state": 64} for id in ("convection_diffusion_reaction", "allen_cahn")}
+SETTINGS["he3"] = {"action_limit": 10.0}
 
 
 class ControlGym(gymnasium.Wrapper):
@@ -216,16 +218,21 @@ def controlgym(plant: str) -> Any:
     """Make a controlgym environment."""
     with warnings.catch_warnings():  # the package turns all warnings into errors
         package, _ = import_module("controlgym"), import_module("controlgym.controllers")
-    return package.make(plant, n_steps=100, action_limit=1.0, **SIZES.get(plant, {}))
+    settings = {"n_steps": 100, "action_limit": 1.0} | SETTINGS.get(plant, {})
+    return package.make(plant, **settings)
 
 
-def controlgym_lqg(plant: str) -> float:
+def controlgym_lqg(plant: str, crossed: bool = True) -> float:
     """Return J of LQG with the true matrices, the limits of the action and an unknown first state.
 
-    The filter begins with the distribution of the first states of 1,000 resets.
+    The filter begins with the distribution of the first states of 1,000 resets. If not ``crossed``,
+    the regulator's weight has no products of states and actions, as a `LinearMPC` has none.
     """
     env = controlgym(plant)
+    whole = env.S
+    env.S = whole if crossed else np.zeros_like(whole)
     lqg = import_module("controlgym.controllers").LQG(env)
+    env.S = whole
     A, B, C = env.A, env.B2, env.C
     if hasattr(env, "B1"):
         W, V = (env.noise_cov * x @ x.T for x in (env.B1, env.D21))
@@ -242,7 +249,7 @@ def controlgym_lqg(plant: str) -> float:
         y, over, J = env.reset(seed=EVAL_SEED + i)[0], False, 0.0
         x, P = corrected(first.mean(0), np.cov(first.T).reshape(A.shape), y)
         while not over:
-            u = np.clip(lqg.select_action(x), -1.0, 1.0)
+            u = np.clip(lqg.select_action(x), env.action_space.low, env.action_space.high)
             y, reward, terminated, truncated, _ = env.step(u)  # y is of the state before
             x, P = corrected(x, P, y)
             x, P = A @ x + B @ u, A @ P @ A.T + W
@@ -347,6 +354,7 @@ PLANTS = {
     "controlgym toy": _controlgym("toy"),
     "controlgym je2": _controlgym("je2"),
     "controlgym he4": _controlgym("he4"),
+    "controlgym he3": _controlgym("he3"),
     "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
     "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
     "pcgym heat_exchanger": _pcgym("heat_exchanger"),
