@@ -200,7 +200,9 @@ def pcgym_oracle(model: str) -> float:
 
 #: Points of the partial differential equations, so that an episode takes less than a second; and
 #: the limit of the actions where 1 is too little for the plant.
-SETTINGS = {id: {"n_state": 64} for id in ("convection_diffusion_reaction", "allen_cahn")}
+SETTINGS: dict[str, Any] = {
+    id: {"n_state": 64} for id in ("convection_diffusion_reaction", "allen_cahn")
+}
 SETTINGS["he3"] = {"action_limit": 10.0}
 
 
