@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,28 @@ def test_the_report_is_printed():
     assert head.split() == ["steps", "RMSE", "of", "y1,", "y2", "R2,", "cross-validated"]
     assert [int(row.split()[0]) for row in rows] == [1, 2, 5, 6]
     assert all(len(row.split()) == 5 for row in rows)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_the_report_says_that_inputs_are_logged_a_row_late(late, unit):
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 302), np.zeros(302)
+    for k in range(301):
+        y[k + 1] = 0.8 * y[k] + 0.5 * u[k] + 0.1 * rng.normal()
+    found = qm.identify({"y": unit * y[late:300], "u": u[: 300 - late]}, N)
+    said = re.search(
+        r"The inputs of a row explain (\d+)% of the residuals of its y\..* up a row", str(found)
+    )
+    assert (said is not None) == (late == 1)
+    assert said is None or int(said[1]) > 50
+
+
+def test_an_exact_log_is_not_said_to_be_late():
+    u, y = np.random.default_rng(0).uniform(-1, 1, 50), np.zeros(51)
+    for t in range(50):
+        y[t + 1] = 0.9 * y[t] + 0.5 * u[t]
+    assert "up a row" not in str(qm.identify({"y": y, "u": u}, N))
 
 
 def test_errors_are_those_of_data_that_the_fit_has_not_seen():

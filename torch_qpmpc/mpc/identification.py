@@ -17,13 +17,21 @@ from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.log import Log, as_log
-from torch_qpmpc.mpc.subspace import Fit, fit_state_space, held_out_errors, whiteness
+from torch_qpmpc.mpc.subspace import (
+    Fit,
+    explained_by_inputs,
+    fit_state_space,
+    held_out_errors,
+    whiteness,
+)
 from torch_qpmpc.mpc.validation import ungraded
 
 #: Steps of a prediction by default.
 HORIZON = 20
 #: An action that the other regressors explain up to this share of its size does not excite.
 STILL = 1e-6
+#: The share of the residuals' variance that the inputs of the same rows may explain.
+LATE = 0.1
 EXCITE = "Add a random signal to the action, independent of the outputs."
 
 
@@ -113,6 +121,13 @@ class Identified:
             f"Model of order {len(self.model.A)} with poles of sizes {poles}",
             f"Autocorrelations of the residuals in their 95 % bound: {white}",
         ]
+        shares = explained_by_inputs(self.model, log.trajectories)
+        if shares.max() > LATE:
+            output = log.label(log.outputs[int(shares.argmax())])
+            lines.append(
+                f"The inputs of a row explain {shares.max():.0%} of the residuals of its {output}. "
+                "Unless a controller chose them, they acted before the outputs: move them up a row."
+            )
         rows = [("RMSE of " + ", ".join(map(log.label, log.outputs)), "R2, cross-validated")]
         longest = min(N, max(part.steps for part in log.trajectories))  # single steps have one
         steps = sorted({k for k in (1, 2, 5, 10, 20, 50, 100) if k < longest} | {longest})

@@ -163,6 +163,28 @@ def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     return np.mean(inside, 0)
 
 
+def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
+    """Return the share of residuals' variance that inputs of the same rows explain, ``(n_y,)``.
+
+    The model predicts an output from the inputs of the rows before: a share above zero is feedback,
+    or an input that is logged a row late.
+    """
+    pairs, sizes = [], []
+    for (y, v), _ in _batches(_signals(trajectories)):
+        u, d = np.split(v, [model.B.shape[1]], -1)
+        rows = np.concatenate((model.errors(y, u, d, 1)[..., :-1, 0, :], u[..., 1:, :]), -1)
+        pairs.append(rows.reshape(-1, rows.shape[-1]))
+        sizes.append(np.nanmax(np.abs(y), (0, 1)))
+    rows = np.concatenate(pairs)
+    rows = rows[np.isfinite(rows).all(1)]
+    e, u = np.split(rows - rows.mean(0), [len(model.C)], 1)
+    left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
+    degrees = max(len(rows) - u.shape[1] - 1, 1)
+    before, after = (e**2).sum(0) / max(len(rows) - 1, 1), (left**2).sum(0) / degrees
+    noisy = before > (EXACT * np.max(sizes, 0)) ** 2
+    return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
+
+
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
     states = []
