@@ -14,10 +14,10 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 FIRST = ("config", "optimizer/gauss_newton", "constraint/combined", "task/point_mass")
 TITLE = """# All configuration keys
 
-You set a key by `python train.py KEY=VALUE`, or several by a choice, as `task=pendulum`. If several
-choices set a key, the rightmost of `defaults` in `configs/config.yaml` counts. The usual value
-comes first, then the values of single choices. Units are the plant's unless the meaning says
-otherwise.
+Set a key by `python train.py KEY=VALUE`, or several at once by a choice such as `task=pendulum`.
+If several choices set a key, the last one in `defaults` of `configs/config.yaml` counts. Each row
+has the usual value first, then the values of single choices. Units are the plant's unless the
+meaning says otherwise.
 """
 GROUPS = {
     "constraint": "Constraints and their penalties: `constraint=NAME`",

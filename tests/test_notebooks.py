@@ -37,11 +37,11 @@ def cells(path: Path) -> list[dict[str, Any]]:
 
 
 def run(command: list[str], **options: Any) -> Any:
-    """Run ``python train.py ..`` in this process and shortly, other commands as they are."""
-    if command[1] != "train.py":
+    """Run ``python -m torch_qpmpc.train ..`` in this process and shortly, others as they are."""
+    if command[1:3] != ["-m", "torch_qpmpc.train"]:
         return in_a_process(command, **options)
     with contextlib.redirect_stdout(io.StringIO()) as stdout:
-        run_command(*command[2:], *SHORT)
+        run_command(*command[3:], *SHORT)
     return SimpleNamespace(stdout=stdout.getvalue())
 
 
