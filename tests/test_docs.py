@@ -47,11 +47,14 @@ def test_blocks_are_found():
     assert commands(text) == [["ls", "-l"]]
 
 
+#: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs.
+SLOW = [f"docs/guides/{name}.md" for name in ("torchrl", "environment", "prove")]
+
+
 @pytest.mark.parametrize(
     "page",
     [
-        # README.md learns by TorchRL in small.
-        pytest.param(page, marks=pytest.mark.slow if page == "docs/guides/torchrl.md" else ())
+        pytest.param(page, marks=pytest.mark.slow if page in SLOW else ())
         for page, text in PAGES.items()
         if fenced(text, "python")
     ],

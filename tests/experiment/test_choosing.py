@@ -250,18 +250,12 @@ def test_the_gate_copies_a_held_action_into_the_scheme_that_learning_begins_with
     assert scheme.policy(torch.ones(1, physics.n_x, dtype=torch.float64)).abs() < 1e-12
 
 
-def trained_and_resumed(cfg, folder, monkeypatch=None) -> FinishedRun:
-    """Train; the files have the policies evaluated, and a run that is cut ends likewise."""
-    whole, cut = folder / "whole", folder / "cut"
-    summary, run = train.train(cfg, str(whole), quiet=True), FinishedRun(whole)
+def trained(cfg, folder) -> FinishedRun:
+    """Train; the files have the policies that were evaluated."""
+    summary, run = train.train(cfg, str(folder), quiet=True), FinishedRun(folder)
     for name, policy in (("J_start", run.start), ("J_best", run.policy)):
         J = evaluate(cfg, warm_policy(policy), run.physics).J
         assert summary[name] == pytest.approx(J, rel=1e-9)
-    if monkeypatch is None:
-        return run
-    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
-    run_command(f"resume={cut}")
-    assert FinishedRun(cut).summary["J_best"] == summary["J_best"]
     return run
 
 
@@ -281,7 +275,7 @@ def turning(monkeypatch):
 @pytest.mark.usefixtures("turning")
 def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path):
     settings = ("optimizer=gauss_newton", "constraint=mpc")
-    run = trained_and_resumed(make_config(*DATA, *settings), tmp_path)
+    run = trained(make_config(*DATA, *settings), tmp_path)
     assert run.summary["start"].startswith(BLENDED)
     assert run.policy.schedule is not None
     assert run.start.schedule is not None
@@ -316,22 +310,17 @@ def swing(monkeypatch):
 
 
 @pytest.mark.usefixtures("swing")
-def test_a_hidden_state_is_estimated_and_a_finished_run_has_its_observer(tmp_path, monkeypatch):
+def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_chosen(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(choosing, "candidates", candidates)
     settings = ("task.eval_steps=30", "task.gamma=1.0", "constraint=mpc", "eval_interval=4")
-    run = trained_and_resumed(make_config(*DATA, *settings), tmp_path, monkeypatch)
+    cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
+    run = trained(cfg, whole)
     plant: Any = run.physics
     assert run.observer is not None
     assert plant.n_x == run.policy.n_x == run.summary["order"] == len(run.observer.A) >= 2
     assert run.summary["J_start"] < 25, "16 with both states known, 37 by feedback of the position"
-    (tmp_path / "whole" / OBSERVER).write_bytes(b"text")
-    with pytest.raises(QPError, match=r"path: got .*observer\.pt, which cannot be read"):
-        _ = FinishedRun(tmp_path / "whole").physics
-
-
-def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
-    monkeypatch.setattr(choosing, "candidates", candidates)
-    cfg, whole, cut = make_config(*DATA), tmp_path / "whole", tmp_path / "cut"
-    train.train(cfg, str(whole), quiet=True)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     assert (cut / STARTS).read_bytes() == (whole / STARTS).read_bytes()
     (cut / STARTS).rename(tmp_path / STARTS)
@@ -341,14 +330,16 @@ def test_a_run_resumes_with_the_start_that_it_has_chosen(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("torch_qpmpc.experiment.start.choose", None)
         run_command(f"resume={cut}")
-    runs = FinishedRun(whole), FinishedRun(cut)
-    constants = [run.policy.c.item() for run in runs]
-    assert constants[0] != runs[0].start.c.item(), "it is corrected after the warm-up"
+    resumed = FinishedRun(cut)
+    constants = [x.policy.c.item() for x in (run, resumed)]
+    assert constants[0] != run.start.c.item(), "it is corrected after the warm-up"
     assert constants[0] == constants[1]
-    entries = ("J_start", "start", "start_transitions")
-    first, second = ({key: run.summary[key] for key in entries} for run in runs)
-    assert first == second
-    assert torch.equal(runs[0].start.C, runs[1].start.C)
+    for key in ("J_start", "J_best", "start", "start_transitions"):
+        assert run.summary[key] == resumed.summary[key]
+    assert torch.equal(run.start.C, resumed.start.C)
+    (whole / OBSERVER).write_bytes(b"text")
+    with pytest.raises(QPError, match=r"path: got .*observer\.pt, which cannot be read"):
+        _ = FinishedRun(whole).physics
 
 
 def table(*rows: tuple[Any, ...], names: list[str]) -> pd.DataFrame:

@@ -109,8 +109,10 @@ def test_batch_sizes_and_updates_of_theta_do_not_compile_again(name):
 
 @pytest.mark.parametrize(
     "transformed",
-    [lambda f: vmap(grad(f)), lambda f: lambda s: jvp(f, (s,), (torch.ones_like(s),))[1]],
-    ids=["vmap of grad", "jvp"],
+    [
+        pytest.param(lambda f: vmap(grad(f)), id="vmap of grad", marks=pytest.mark.slow),
+        pytest.param(lambda f: lambda s: jvp(f, (s,), (torch.ones_like(s),))[1], id="jvp"),
+    ],
 )
 def test_transforms_that_cannot_be_compiled_are_refused_or_left_eager(transformed):
     mpc, s = random_mpc(3), random_states(4)
