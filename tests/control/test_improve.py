@@ -68,9 +68,9 @@ def test_its_gradient_is_that_of_finite_differences(case):
     mpc, plant = controller.mpc, loops(controller)
 
     def cost() -> torch.Tensor:
-        return _Loops(plant, 4, 1).run(mpc, 8).costs.mean()
+        return _Loops(plant, 3, 1).run(mpc, 6).costs.mean()
 
-    _Loops(plant, 4, 1).mean_cost(mpc, 8).backward()
+    _Loops(plant, 3, 1).mean_cost(mpc, 6).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
     for name, leaf in mpc.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:
@@ -126,11 +126,11 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
     controller = made("bounds", learn=("H", "H_f", "q", "b"))
     controller.reset(y={"T": 20.0}, u={"q": 5.0}, known={"d": 0.0, "price": 1.0, "top": 21.0})
     before, u = copy.deepcopy(controller.mpc.state_dict()), controller.u
-    options = {"r": [20.9], "spread": 0.2, "updates": 12, "loops": 16, "steps": 25, "held_out": 64}
+    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
     report = controller.improve(logged(), **options)
     assert report.kept
     assert report.after < 0.9 * report.before
-    assert len(report.curve) == 12
+    assert len(report.curve) == 8
     assert not all(torch.equal(before[k], x) for k, x in controller.mpc.state_dict().items())
     assert np.array_equal(controller.u, u)
     now = {"d": 0.0, "price": 1.0, "top": 21.0}
