@@ -263,7 +263,7 @@ def _held(values: Tensor) -> Tensor:
 def _draw_band(axes: Axes, times: Tensor, lower: Tensor, upper: Tensor) -> None:
     """Draw both bounds, which hold at the steps, and shade the band where there are both."""
     band = axes.fill_between(times, lower, upper, step="post", color="tab:green", alpha=0.12)
-    band.set_label("band")
+    band.set_label("" if torch.cat((lower, upper)).isnan().all() else "band")
     for side in (lower, upper):
         axes.step(times, side, where="post", color="tab:green", linewidth=0.8)
 
