@@ -73,7 +73,7 @@ BUDGET = {
     "learning": 2850,
     "mpc": 5166,
     "proofs": 999,
-    "qp": 5893,
+    "qp": 5712,
     "study": 547,
 }
 #: Libraries that only some layers may import.

@@ -41,23 +41,18 @@ def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
     return out
 
 
-def sum_to(tensor: Tensor, like: Tensor) -> Tensor:
-    """Sum a batched gradient to the shape of its operand."""
-    return tensor.sum_to_size(like.shape)
-
-
 def weighted_sum(weight: Tensor, vectors: Tensor, like: Tensor) -> Tensor:
     """Sum ``weight`` ``(*batch,)`` times ``(*batch, n)`` over the dimensions ``like`` lacks."""
     if like.ndim == 1:
         return weight.reshape(-1) @ flatten_batch(vectors)
-    return sum_to(weight.unsqueeze(-1) * vectors, like)
+    return (weight.unsqueeze(-1) * vectors).sum_to_size(like.shape)
 
 
 def outer(left: Tensor, right: Tensor, like: Tensor) -> Tensor:
     """Sum the outer products ``left right'`` over the batch dimensions ``like`` lacks."""
     if like.ndim == 2:
         return flatten_batch(left).mT @ flatten_batch(right)
-    return sum_to(left.unsqueeze(-1) * right.unsqueeze(-2), like)
+    return (left.unsqueeze(-1) * right.unsqueeze(-2)).sum_to_size(like.shape)
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import outer, sum_to, times, weighted_sum
+from torch_qpmpc.qp.batching import outer, times, weighted_sum
 from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import saturated_rows, slacks, upper_share
@@ -64,7 +64,7 @@ def envelope_gradients(
     return {
         "H": lambda like: 0.5 * outer(weighted_z, z, like),
         "q": lambda like: weighted_sum(weight, z, like),
-        "c": lambda like: sum_to(weight, like),
+        "c": lambda like: weight.sum_to_size(like.shape),
         "C": lambda like: outer(chi, weighted_z, like),
         "b": lambda like: weighted_sum(negative, chi, like),
         "G": lambda like: outer(lam, weighted_z, like),
@@ -136,19 +136,19 @@ def _solution_gradients(
 
     def of_w() -> Tensor:
         slope = lam.sign() * (grad_lam - times(G, p))
-        return sum_to(torch.where(saturated_rows(lam, w), slope, 0), w)
+        return torch.where(saturated_rows(lam, w), slope, 0).sum_to_size(w.shape)
 
     formulas = (
         of_H,
-        lambda: sum_to(-p, q),
+        lambda: (-p).sum_to_size(q.shape),
         lambda: torch.zeros_like(c),
         lambda: -(outer(chi, p, C) + outer(r, z, C)),
-        lambda: sum_to(r, b),
+        lambda: r.sum_to_size(b.shape),
         lambda: -(outer(lam, p, G) + outer(t, z, G)),
-        lambda: sum_to((1 - upper) * t, lb),
-        lambda: sum_to(upper * t, ub),
+        lambda: ((1 - upper) * t).sum_to_size(lb.shape),
+        lambda: (upper * t).sum_to_size(ub.shape),
         of_w,
-        lambda: sum_to(u, fixed),
+        lambda: u.sum_to_size(fixed.shape),
     )
     return (f() if need else None for f, need in zip(formulas, needed, strict=True))
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, schema, times
-from torch_qpmpc.qp.kernels.sample_torch import largest, multiply
+from torch_qpmpc.qp.kernels.sample_torch import hold, largest, multiply
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, native_device, to_numpy, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, Status
@@ -85,10 +86,7 @@ def solve_kkt(*arguments: Any) -> KKTSolution:
 
 def _solve_kkt(programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam) -> KKTSolution:
     n_f, theta = programs.n_f, programs.prepared.theta
-
-    def tensor(x: Any) -> Tensor:
-        return torch.as_tensor(x, device=z.device)
-
+    tensor = partial(torch.as_tensor, device=z.device)
     group = tensor(programs.group)
     H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
     T, Y_neg, H_y, G_y, _, _ = map(tensor, programs.prepared.condensed(n_f).arrays)
@@ -115,10 +113,7 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     They are those of `active_rows`, and those that `implied_equalities` adds; rows without a free
     variable have no part in the KKT system.
     """
-
-    def tensor(x: Any) -> Tensor:
-        return torch.as_tensor(x, device=y.device)
-
+    tensor = partial(torch.as_tensor, device=y.device)
     lb, ub, w = map(tensor, programs.theta[6:9])
     if (units := programs.prepared.units) is not None:  # zero and equal are relative to these
         rows, cost = tensor(units.rows)[programs.group], tensor(units.cost)[programs.group]
@@ -195,14 +190,16 @@ def _solve_active(
     group = torch.as_tensor(programs.group, device=H.device)
     if 1 < len(H) == len(group):
         return _solve_dense(H[group], G[group], active, right_v, right_t)
-    to_g = to_tensor(programs.prepared.sensitivities(programs.n_f).to_g)
+    to_g, to_lam = map(to_tensor, programs.prepared.sensitivities(programs.n_f))
+    rows = to_tensor(programs.prepared.reduced(programs.n_f).rows)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
     size = terms = largest(right_v) * 0
     regular = size < 0
     for _ in range(PASSES):
         free = multiply(to_g.mT, group, of_v)
-        dv, dt = programs.hold(free, active, of_t)
-        v, t = v + dv, t + dt
+        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows], 0.0)
+        dv = vy[:, : v.shape[-1]]
+        v, t = v + dv, t.index_add(1, rows, dt)
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)
         of_t = torch.where(active, right_t - multiply(G, group, v), 0)
         size = size + largest(dv) + largest(free[:, : v.shape[-1]])  # the active rows may cancel v

@@ -7,7 +7,7 @@ and a Function around it that is differentiable under `torch.func` and in forwar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -93,10 +93,12 @@ def solve(
     batch = _checked_batch(qp, fixed)
     start = _checked_start(qp, batch, warm_start)
     theta = (*qp.tensors(), fixed)
-    options = (fixed.shape[-1] if n_kept is None else n_kept, solver, on_failure)
+    n_kept = fixed.shape[-1] if n_kept is None else n_kept
+    run: Callable[..., tuple[Tensor, ...]] = solve_traced
     if is_eager(theta):
-        return QPSolution(qp, *solve_eager(theta, start, *options))
-    return QPSolution(qp, *solve_traced(*theta, start, *options))
+        learned = torch.is_grad_enabled() and any(x.requires_grad for x in theta)
+        run = Eager.apply if learned else solve_now
+    return QPSolution(qp, *run(*theta, start, n_kept, solver, on_failure))
 
 
 def _checked_batch(qp: QuadraticProgram, fixed: Tensor) -> tuple[int, ...]:
@@ -135,35 +137,6 @@ def _checked_start(
             "Pass the solution of the same batch of QPs, or its `active`.",
         )
     return active
-
-
-def solve_eager(
-    theta: Sequence[Tensor], start: Tensor | None, n_kept: int, solver: str, on_failure: str
-) -> tuple[Tensor, ...]:
-    """Solve; value, z, chi, lam and xi are differentiable in ``theta``, H to w and fixed."""
-    outputs = tuple(solve_now(*theta, start, n_kept, solver, on_failure))
-    if torch.is_grad_enabled() and any(x.requires_grad for x in theta):
-        outputs = (*Solution.apply(outputs[:6], n_kept, *theta), *outputs[5:])
-    return outputs
-
-
-class Solution(torch.autograd.Function):
-    """The derivatives of a computed solution in theta."""
-
-    @staticmethod
-    def forward(ctx: Any, known: Sequence[Tensor], n_kept: int, *theta: Tensor) -> tuple:
-        *solution, status = known
-        ctx.set_materialize_grads(False)
-        ctx.n_kept = n_kept
-        # Saving z, chi, lam and xi, which are outputs, makes this backward differentiable.
-        ctx.save_for_backward(*theta, *solution[1:], status)
-        return tuple(solution)
-
-    @staticmethod
-    def backward(ctx: Any, *incoming: Tensor | None) -> tuple:  # pyright: ignore[reportIncompatibleMethodOverride]
-        theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
-        needed = ctx.needs_input_grad[2:]
-        return None, None, *gradients(incoming, theta, solution, needed, ctx.n_kept)
 
 
 NAMES = (*EVENT_SHAPES, "fixed")
@@ -266,6 +239,14 @@ class Traced(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple, *args: Any) -> tuple:
         return Traced.apply(*align(in_dims, args, EVENT_NDIMS)), (0,) * 10
+
+
+class Eager(Traced):
+    """`solve_now` itself, without the operator."""
+
+    @staticmethod
+    def forward(*arguments: Any) -> tuple[Tensor, ...]:
+        return solve_now(*arguments)
 
 
 class TracedForward(Traced):

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -82,31 +81,22 @@ def _mark() -> None:
 os.register_at_fork(after_in_child=_mark)
 
 
-@contextmanager
-def serial_if_forked() -> Iterator[None]:
-    """Use one thread of torch in a forked child, and restore the child's own number.
-
-    OpenMP's threads do not exist there, and torch would wait for them.
-    """
-    if not _forked:
-        yield
-        return
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def serially_if_forked(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function that the compiler may trace within `serial_if_forked`."""
+    """Run a function that the compiler may trace with one thread of torch in a forked child.
+
+    OpenMP's threads do not exist there, and torch would wait for them. The child's own number of
+    threads is restored.
+    """
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         if not _forked:
             return function(*args, **kwargs)
-        with serial_if_forked():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
             return function(*args, **kwargs)
+        finally:
+            torch.set_num_threads(threads)
 
     return wrapped

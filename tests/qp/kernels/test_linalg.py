@@ -13,16 +13,10 @@ from tests.problems import normal
 from torch_qpmpc import QPError
 from torch_qpmpc.qp.kernels import linalg
 from torch_qpmpc.qp.kernels.linalg import products, transposed_products
-from torch_qpmpc.qp.pipeline.condensing import DEFINITE, SHIFT
 
 RNG = np.random.default_rng(0)
 #: The spans of more than one matrix.
 NONE = np.zeros((0, 2), np.int64)
-
-
-def matrix_with(eigenvalues: list[float]) -> np.ndarray:
-    basis = np.linalg.qr(RNG.normal(size=(len(eigenvalues),) * 2))[0]
-    return (basis * eigenvalues) @ basis.T
 
 
 def test_without_a_writable_cache_kernels_are_compiled_each_time(monkeypatch):
@@ -119,57 +113,6 @@ def test_a_band_is_eliminated(width):
     assert regular
     np.testing.assert_allclose(C @ T, 0, atol=1e-9)
     np.testing.assert_allclose(-C @ Y_neg, np.eye(n_c)[None].repeat(2, 0), atol=1e-9)
-
-
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_a_definite_matrix_gets_the_inverse_of_its_cholesky_factor(size):
-    H = size * np.stack([matrix_with([1.0, 2.0, 5.0, 1e-3]), matrix_with([3.0] * 4)])
-    inverses, shifts = linalg.inverse_factors(H, DEFINITE, SHIFT)
-    assert (shifts == 0).all()
-    np.testing.assert_allclose(
-        inverses, np.linalg.inv(np.linalg.cholesky(H)), rtol=1e-9, atol=1e-9 * size**-0.5
-    )
-
-
-def test_a_singular_matrix_is_shifted_by_a_part_of_its_largest_diagonal_entry():
-    H = matrix_with([1.0, 2.0, 0.0])[None]
-    inverses, shifts = linalg.inverse_factors(H, DEFINITE, SHIFT)
-    assert shifts == pytest.approx(SHIFT * H.diagonal(axis1=1, axis2=2).max())
-    whole = inverses[0].T @ inverses[0] @ (H[0] + shifts * np.eye(3))
-    np.testing.assert_allclose(whole, np.eye(3), atol=1e-5)
-
-
-def test_zeros_are_shifted_and_neither_an_indefinite_matrix_nor_nan_has_a_factor():
-    H = np.stack([matrix_with([1.0, -1.0]), np.full((2, 2), np.nan), np.zeros((2, 2)), np.eye(2)])
-    inverses, shifts = linalg.inverse_factors(H, DEFINITE, SHIFT)
-    assert np.isposinf(inverses[:2]).all()
-    assert np.isfinite(inverses[2]).all()
-    assert shifts[2] > 0 == shifts[3]
-    np.testing.assert_allclose(inverses[3], np.eye(2))
-
-
-def test_rows_up_to_a_size_have_no_length():
-    G = RNG.normal(size=(2, 3, 4))
-    G[0, 1] *= 1e-9
-    lengths = linalg.row_lengths(G, np.full((2, 3), 1e-6))
-    expected = np.linalg.norm(G, axis=-1)
-    expected[0, 1] = 0
-    np.testing.assert_allclose(lengths, expected)
-
-
-@pytest.mark.parametrize(("cosine", "expected"), [(0.0, True), (0.4, True), (0.6, False)])
-def test_rows_are_nearly_orthogonal_up_to_a_cosine_of_a_half(cosine, expected):
-    units = np.array([[[1.0, 0.0], [cosine, np.sqrt(1 - cosine**2)]]])
-    assert linalg.nearly_orthogonal(units) == expected
-
-
-def test_finite_sizes_are_the_largest_of_the_qps_that_share_a_matrix():
-    vectors = np.array([[1.0, -np.inf], [-3.0, np.nan], [2.0, 5.0]])
-    sizes = linalg.finite_sizes(vectors, np.array([1, 1, 0]), 2)
-    np.testing.assert_array_equal(sizes, [[2.0, 5.0], [3.0, 0.0]])
-    np.testing.assert_array_equal(
-        linalg.finite_sizes(vectors[2:], np.zeros(9, int), 2), [[2, 5]] * 2
-    )
 
 
 class Terminal(io.StringIO):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import CPU, KnownQP, known_qp, normal, programs_of, random_mpc, random_states
+from tests.problems import CPU, KnownQP, known_qp, programs_of, random_mpc, random_states
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -177,23 +177,6 @@ def test_active_sets_are_tried_as_by_torch(matrices):
         known = known_qp(seed, batch=(BATCH,), matrices=matrices)
         active = solve_qp(known.qp, known.fixed, solver="torch").active
         assert assert_settled_alike(*both(known), active) == BATCH
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_held_rows_get_their_levels(matrices):
-    for p in both(known_qp(2, batch=(BATCH,), matrices=matrices)):
-        reduced = p.prepared.reduced(p.n_f)
-        H, G, rise = map(to_tensor, (reduced.H, reduced.G, p.prepared.sensitivities(p.n_f).to_g))
-        (r, d), rows = G.shape[1:], to_tensor(reduced.rows)
-        held = torch.zeros(BATCH, p.theta.G.shape[1], dtype=torch.bool)
-        held[torch.arange(1, BATCH), rows[torch.arange(1, BATCH) % r]] = True  # none in the first
-        right, level = normal(BATCH, d), normal(*held.shape, seed=1)
-        v, t = p.hold((rise.mT @ right.unsqueeze(-1)).squeeze(-1), held, level)
-        assert (t[~held] == 0).all()
-        assert t[held].abs().min() > 1e-3
-        assert_close((H @ v.unsqueeze(-1) + G.mT @ t[:, rows, None]).squeeze(-1), right)
-        y = (G @ v.unsqueeze(-1)).squeeze(-1)
-        assert_close(y[held[:, rows]], level[held])
 
 
 @pytest.mark.parametrize("changes", [1, 2, 3])

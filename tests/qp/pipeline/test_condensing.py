@@ -13,13 +13,16 @@ from torch_qpmpc import Status, solve_qp
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.pipeline.arrays import Theta
 from torch_qpmpc.qp.pipeline.condensing import (
+    SHIFT,
     Elimination,
     Reduced,
     condense,
     eliminate,
     in_order,
+    inverse_factors,
     null_space,
     sensitivities,
+    sizes,
 )
 from torch_qpmpc.qp.solve import solve
 
@@ -217,3 +220,45 @@ def test_the_reduced_problem_is_the_problem_in_fewer_variables(batch, matrices):
         assert_close(qps.w, data.w[..., rows].expand(len(p), -1))
         bounded = torch.isfinite(torch.maximum(data.lb, -data.ub))[..., others].any(0)
         assert_close(y[0][..., others][:, bounded], y[1][..., others][:, bounded])
+
+
+def matrix_with(eigenvalues: list[float]) -> np.ndarray:
+    basis = np.linalg.qr(normal(len(eigenvalues), len(eigenvalues)).numpy())[0]
+    return (basis * eigenvalues) @ basis.T
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_definite_matrix_gets_the_inverse_of_its_cholesky_factor(size):
+    H = size * np.stack([matrix_with([1.0, 2.0, 5.0, 1e-3]), matrix_with([3.0] * 4)])
+    inverses, shifts = inverse_factors(H)
+    assert (shifts == 0).all()
+    np.testing.assert_allclose(
+        inverses, np.linalg.inv(np.linalg.cholesky(H)), rtol=1e-9, atol=1e-9 * size**-0.5
+    )
+
+
+def test_a_singular_matrix_is_shifted_by_a_part_of_its_largest_diagonal_entry():
+    H = matrix_with([1.0, 2.0, 0.0])[None]
+    inverses, shifts = inverse_factors(H)
+    assert shifts == pytest.approx(SHIFT * H.diagonal(axis1=1, axis2=2).max())
+    whole = inverses[0].T @ inverses[0] @ (H[0] + shifts * np.eye(3))
+    np.testing.assert_allclose(whole, np.eye(3), atol=1e-5)
+
+
+def test_zeros_are_shifted_and_neither_an_indefinite_matrix_nor_nan_has_a_factor():
+    H = np.stack([matrix_with([1.0, -1.0]), np.full((2, 2), np.nan), np.zeros((2, 2)), np.eye(2)])
+    inverses, shifts = inverse_factors(H)
+    assert np.isposinf(inverses[:2]).all()
+    assert np.isfinite(inverses[2]).all()
+    assert shifts[2] > 0 == shifts[3]
+    np.testing.assert_allclose(inverses[3], np.eye(2))
+
+
+@pytest.mark.parametrize(("cosine", "apart"), [(0.0, True), (0.4, True), (0.6, False)])
+def test_hard_rows_are_apart_up_to_a_cosine_of_a_half(cosine, apart):
+    G = torch.tensor([[[1.0, 0.0], [2 * cosine, 2 * (1 - cosine**2) ** 0.5]]]).double()
+    theta = theta_of(torch.eye(2)[None].double(), torch.zeros(1, 0, 2).double(), G)
+    theta = theta._replace(w=np.full((1, 2), np.inf))
+    found = sizes(condense(theta, 0), theta, 0)
+    assert found.apart is apart
+    np.testing.assert_allclose(found.steps, [[1, 2]])

@@ -11,7 +11,8 @@ from torch.testing import assert_close
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.scaling import finite_sizes
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 
 BATCH = 4
@@ -43,12 +44,6 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     assert prepared.units is not None
     assert all((np.frexp(unit)[0] == 0.5).all() for unit in prepared.units)
     assert prepared.scaled.units is None
-    args = prepared.theta, prepared.group, prepared.n_kept, None
-    own, other = Prepared(*args), Prepared(*args)
-    assert other.scaled.units is None  # then the matrices are condensed in units, and restored
-    own, other = (x.condensed(prepared.n_kept) for x in (own, other))
-    arrays = ((*x.arrays, x.terms, *x.sums) for x in (own, other))
-    assert all((a == b).all() for a, b in zip(*arrays, strict=True))
 
 
 def test_what_rounding_leaves_of_a_zero_sets_no_unit():
@@ -138,3 +133,10 @@ def test_a_batch_of_invalid_qps_in_unusual_units_is_invalid():
     qp = replace(known.qp, C=C, check_values=False)
     status = solve_qp(qp, known.fixed, on_failure="mask").status
     assert (status == Status.INVALID_DATA).all()
+
+
+def test_finite_sizes_are_the_largest_of_the_qps_that_share_a_matrix():
+    vectors = np.array([[1.0, -np.inf], [-3.0, np.nan], [2.0, 5.0]])
+    sizes = finite_sizes(vectors, np.array([1, 1, 0]), 2)
+    np.testing.assert_array_equal(sizes, [[2.0, 5.0], [3.0, 0.0]])
+    np.testing.assert_array_equal(finite_sizes(vectors[2:], np.zeros(9, int), 2), [[2, 5]] * 2)

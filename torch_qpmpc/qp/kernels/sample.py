@@ -28,12 +28,11 @@ largest of 1/2 z'Hz, q'z, w'sigma and their sum, or to a millionth of the *swing
 the sum of ``|Hz + q| (ub - lb)`` over the entries with hard bounds, by which the cost changes, to
 first order, between these bounds. Where the cost is zero, its errors are small beside the swing.
 
-With a fixed active set, the KKT conditions are linear. `hold` solves them by the Schur complement
-of H, with one Cholesky factor per QP, of the active part of K = G H^-1 G'. The derivatives of the
-solution use it, and so does a warm start, which tries the active set of a nearly equal QP: between
-two visits to a transition theta changes little, and most active sets stay the same. If the signs of
-the solution contradict the set, the rows concerned change their state, and the new set is tried.
-QPs that do not settle go to the backend.
+With a fixed active set, the KKT conditions are linear. The Schur complement of H solves them, with
+one Cholesky factor per QP, of the active part of K = G H^-1 G'. A warm start tries the active set
+of a nearly equal QP: between two visits to a transition theta changes little, and most active sets
+stay the same. If the signs of the solution contradict the set, the rows concerned change their
+state, and the new set is tried. QPs that do not settle go to the backend.
 """
 
 from __future__ import annotations
@@ -561,32 +560,6 @@ def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
                 break
             done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i % len(w)])
     return vy[:, :d].copy(), lam, steps, done
-
-
-@compiled
-def hold(to_lam, group, vy, held, level, slip):
-    """Solve ``H v + G't = right`` with ``G v = level`` and t = 0 in held and other rows.
-
-    Args:
-        to_lam, group: the `Sensitivities` to lam, and the matrices' index of each QP.
-        vy: v and y = G v for t = 0, ``(B, d + r)``.
-        held, level: the mask of held rows, and their levels, ``(B, r)``.
-        slip: the relative error of y that ends the refinement.
-
-    Returns:
-        v and y, and t; t is zero where the held rows have no Cholesky factor.
-    """
-    n_qps, r = held.shape
-    vy, t = vy.copy(), np.zeros((n_qps, r))
-    rows, factor, change = np.empty(r, np.int64), np.empty((r, r)), np.empty(r)
-    for i in range(n_qps):
-        k = 0
-        for j in range(r):
-            if held[i, j]:
-                rows[k] = j
-                k += 1
-        _hold_rows(to_lam[group[i]], rows[:k], level[i], slip, vy[i], t[i], factor, change)
-    return vy, t
 
 
 @compiled

@@ -32,7 +32,6 @@ from torch_qpmpc.qp.pipeline.arrays import (
     on_device,
     per_qp,
     to_numpy,
-    to_tensor,
 )
 from torch_qpmpc.qp.pipeline.condensing import (
     Condensed,
@@ -72,7 +71,6 @@ class Prepared:
     ) -> None:
         self.theta, self.group, self.n_kept, self.device = theta, group, n_kept, device
         self._elimination = elimination
-        self._scaled: Prepared | None = None
         self._known: dict[Any, Any] = {}
 
     @cached_property
@@ -100,13 +98,11 @@ class Prepared:
         """Units of the entries of z alone, None if all are one; they do not depend on bounds."""
         return Units.of_columns(self.theta) if self.units and not self.units.one_length else None
 
-    @property
+    @cached_property
     def scaled(self) -> Prepared:
         """The same theta, in its `units`."""
-        if self._scaled is None:
-            assert self.units is not None
-            self._scaled = self._in(self.units)
-        return self._scaled
+        assert self.units is not None
+        return self._in(self.units)
 
     @cached_property
     def equilibrated(self) -> Prepared:
@@ -124,12 +120,9 @@ class Prepared:
         return self._condensed(n_f) if deficient else condensed
 
     def _condensed(self, n_kept: int) -> Condensed:
-        return self._once(("condensed", n_kept), lambda: self._condense(n_kept))
-
-    def _condense(self, n_kept: int) -> Condensed:
-        if self._scaled is not None and self.units is not None and self.units.one_length:
-            return self._scaled._condensed(n_kept).restored(self.units)
-        return condense(self.theta, n_kept, self._elimination)
+        return self._once(
+            ("condensed", n_kept), lambda: condense(self.theta, n_kept, self._elimination)
+        )
 
     def reduced(self, n_f: int) -> Reduced:
         """Return the QPs in their free variables, on the device."""
@@ -386,21 +379,6 @@ class Programs:
         """
         sensitivities = self.prepared.sensitivities(self.n_f)
         return BatchSolution(*self.kernels.recall(active, sensitivities, *self._data()))
-
-    def hold(self, vy: Tensor, held: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
-        """Return v ``(B, d)`` and t ``(B, n_g)`` with ``G v = level`` in the ``held`` rows.
-
-        vy are v and the `reduced_qps`' G v for t = 0, ``(B, d + r)``. The result is wrong or NaN
-        where H or the held rows are singular.
-        """
-        to_lam = self.prepared.sensitivities(self.n_f).to_lam
-        rows = self.prepared.reduced(self.n_f).rows
-        t, rows = torch.zeros_like(level), to_tensor(rows)
-        arrays = vy, held[:, rows], level[:, rows]
-        if isinstance(self.fixed, np.ndarray):
-            arrays = map(to_numpy, arrays)
-        vy, t[:, rows] = map(to_tensor, self.kernels.hold(to_lam, self.group, *arrays, 0.0))
-        return vy[:, : vy.shape[-1] - len(rows)], t
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.

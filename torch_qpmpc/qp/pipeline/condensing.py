@@ -8,7 +8,7 @@ Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the lin
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 
 from torch_qpmpc.qp.kernels import linalg as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
-from torch_qpmpc.qp.pipeline.scaling import Units
+from torch_qpmpc.qp.pipeline.scaling import row_sums
 
 #: A pivot below this fraction of its row's norm means that rows of C are linearly dependent.
 RANK_TOLERANCE = 1e-10
@@ -34,6 +34,7 @@ DEFINITE = 1e-11
 SHIFT = 1e-10
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
+TINY = np.finfo(float).tiny
 
 
 class Elimination(NamedTuple):
@@ -78,18 +79,6 @@ class Condensed:
     n_kept: int
     deficient: bool
     surely_convex: bool
-
-    def restored(self, units: Units) -> Condensed:
-        """Return the matrices before the QPs were scaled by ``units``, with one length for z."""
-        cost, length, rows, equalities = (unit[:, :, None] for unit in units)
-        of_H, of_G, of_C = cost / length**2, rows / length, equalities / length
-        of_b = 1 / of_C.swapaxes(1, 2)
-        T, Y_neg, H, G, H_b, G_b = self.arrays
-        arrays = T, Y_neg * of_b, H * of_H, G * of_G, H_b * (of_H * of_b), G_b * (of_G * of_b)
-        H_sums, G_sums, C_sums = self.sums
-        sums = H_sums * of_H[:, :, 0], G_sums * of_G[:, :, 0], C_sums * of_C[:, :, 0]
-        terms = self.terms * of_G[:, :, 0]
-        return replace(self, arrays=CondensedArrays(*arrays), terms=terms, sums=sums)
 
 
 class Reduced(NamedTuple):
@@ -177,9 +166,9 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     G = _products(theta.G, T)
     # Rounding leaves traces of variables that a row does not contain, and all of a row that C
     # implies: sizes are compared with those before the elimination.
-    terms = np.abs(theta.G) @ kernels.row_sums(T)[:, :, None]
+    terms = np.abs(theta.G) @ row_sums(T)[:, :, None]
     enters = (np.abs(G) > ENTERS * terms).any(0)
-    sums = kernels.row_sums(theta.H), kernels.row_sums(theta.G), kernels.row_sums(theta.C)
+    sums = row_sums(theta.H), row_sums(theta.G), row_sums(theta.C)
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
     convex = padding is None and _has_factor(H)
     return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
@@ -237,7 +226,8 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     """Return the `Sizes` of QPs with the first n_f entries fixed."""
     H = np.ascontiguousarray(condensed.arrays.H[:, n_f:, n_f:])
     G = np.ascontiguousarray(condensed.arrays.G[:, :, n_f:])
-    steps = kernels.row_lengths(G, ABSENT * condensed.terms)
+    steps = np.linalg.norm(G, axis=-1)
+    steps[steps <= ABSENT * condensed.terms] = 0.0
     enters = condensed.enters[:, n_f:]
     single = enters & (enters.sum(-1) == 1)[:, None]
     box = _index_of(single)
@@ -247,12 +237,32 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
     # Contiguous whatever the indices, or the kernels would be compiled for each layout.
     units = np.ascontiguousarray(G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None])
-    apart = kernels.nearly_orthogonal(units)
-    inverse, shift = kernels.inverse_factors(H, DEFINITE, SHIFT)
-    stiffness = kernels.row_sums(H).max(-1, initial=0.0)
+    cosines = row_sums(units @ units.swapaxes(1, 2)) - (steps[:, hard] > 0)
+    apart = bool((cosines < 0.5).all())
+    inverse, shift = inverse_factors(H)
+    stiffness = row_sums(H).max(-1, initial=0.0)
     rows = steps, hard, box, bounds, units, apart
     spans = tuple(map(kernels.row_spans, (*theta[:3], *condensed.arrays[:2])))
     return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, spans)
+
+
+def inverse_factors(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverses of the Cholesky factors of H ``(M, d, d)``, and the shifts ``(M,)``.
+
+    A singular H is shifted by a multiple of I. The inverse is inf if that has no factor either.
+    """
+    matrices, one = torch.from_numpy(H), torch.eye(H.shape[-1], dtype=torch.float64)
+    largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
+    factors, failed = torch.linalg.cholesky_ex(matrices)
+    pivots = factors.numpy().diagonal(axis1=1, axis2=2).min(-1, initial=np.inf) ** 2
+    singular = (failed.numpy() > 0) | ~(pivots > DEFINITE * largest)
+    shift = np.where(singular, np.maximum(SHIFT * largest, TINY), 0.0)
+    if singular.any():
+        shifted = matrices + torch.from_numpy(shift)[:, None, None] * one
+        factors, failed = torch.linalg.cholesky_ex(shifted)
+    inverses = torch.linalg.solve_triangular(factors, one, upper=False).numpy()
+    inverses[failed.numpy() > 0] = np.inf
+    return inverses, shift
 
 
 def _index_of(rows: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.qp.kernels.linalg import column_sizes, finite_sizes, row_sums
 from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
@@ -154,6 +153,26 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
         both = np.concatenate((of_H, of_row + units[k, column] + by_row[k, row]))
         units -= _means(of_column, both, M * n).reshape(M, n)
     return np.exp2(np.round(units))
+
+
+def row_sums(matrices: np.ndarray) -> np.ndarray:
+    """Return the sums of the absolute entries of the rows of ``(M, i, j)``."""
+    return np.abs(matrices).sum(-1)
+
+
+def column_sizes(matrices: np.ndarray) -> np.ndarray:
+    """Return the largest absolute entries of the columns of ``(M, i, j)``."""
+    return np.abs(matrices).max(1, initial=0.0)
+
+
+def finite_sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
+    """Return the largest finite sizes ``(M, n)`` of the vectors ``(B or 1, n)`` of each group."""
+    sizes = np.where(np.isfinite(vectors), np.abs(vectors), 0.0)
+    if len(sizes) == 1 or M == 1:
+        return sizes.max(0, keepdims=True).repeat(M, 0)
+    largest = np.zeros((M, sizes.shape[1]))
+    np.maximum.at(largest, group, sizes)
+    return largest
 
 
 def _means(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

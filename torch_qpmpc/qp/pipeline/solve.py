@@ -35,7 +35,7 @@ from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
-from torch_qpmpc.qp.tracing import serial_if_forked
+from torch_qpmpc.qp.tracing import serially_if_forked
 
 ON_FAILURE = ("raise", "warn", "mask")
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
@@ -109,6 +109,7 @@ class SolveLog:
 _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
+@serially_if_forked
 def solve_now(*arguments: Any) -> BatchSolution:
     """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
 
@@ -122,14 +123,15 @@ def solve_now(*arguments: Any) -> BatchSolution:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
     device = native_device(q) if solver == "torch" else None
     try:
-        with serial_if_forked():
-            programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
-            if start is not None:
-                start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
-            sets = start.numpy(force=True) if start is not None and device is None else start
-            solution = solve_programs(programs, solver, sets)
+        programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
+        if start is not None:
+            start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
+        sets = start.numpy(force=True) if start is not None and device is None else start
+        solution = solve_programs(programs, solver, sets)
     except (MemoryError, RuntimeError) as error:
-        if not _is_out_of_memory(error):
+        # torch's allocator on the CPU reports a failure only in the message.
+        failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
+        if not failed and "DefaultCPUAllocator" not in str(error):
             raise
         shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
         count = broadcast(*shapes, fixed.shape[:-1]).numel()
@@ -148,12 +150,6 @@ def solve_now(*arguments: Any) -> BatchSolution:
         return x.reshape((*batch, *x.shape[1:])).to(q.device, dtype)
 
     return BatchSolution._make(map(out, outputs))
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """True for a failed allocation, which torch's CPU allocator reports only in the message."""
-    kinds = (MemoryError, torch.OutOfMemoryError)
-    return isinstance(error, kinds) or "DefaultCPUAllocator" in str(error)
 
 
 def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:

@@ -20,6 +20,7 @@ magnitude. One d x d Cholesky factor without pivoting suffices, even for depende
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -28,6 +29,8 @@ from torch_qpmpc.qp.kernels.sample_torch import largest
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solution import row_states
 
+#: The largest absolute entry along the last dimension, which is kept.
+_largest = partial(largest, keepdim=True)
 #: Replaces infinity: its reciprocal vanishes in sums, and its square does not overflow.
 HUGE = 1e100
 #: A row up to this narrow, relative to its larger bound, counts as an equality.
@@ -168,11 +171,6 @@ class BatchedQPs:
         return torch.bmm(matrices, vectors.unsqueeze(-1)).squeeze(-1)
 
 
-def _largest(x: Tensor) -> Tensor:
-    """Return the largest absolute entry along the last dimension, which is kept."""
-    return largest(x).unsqueeze(-1)
-
-
 @dataclass
 class Best:
     """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
@@ -181,13 +179,6 @@ class Best:
     lam: Tensor
     residual: Tensor
     steps: Tensor
-
-    @classmethod
-    def initial(cls, qps: BatchedQPs) -> Best:
-        """Return zeros with infinite residuals."""
-        residual = torch.full_like(qps.cost, torch.inf)
-        steps = torch.zeros_like(qps.cost, dtype=torch.int64)
-        return cls(torch.zeros_like(qps.g), torch.zeros_like(qps.w), residual, steps)
 
     def update(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
         """Take the solutions at ``index`` that lower the residual."""
@@ -244,8 +235,9 @@ def solve(qps: SoftQPs) -> BackendSolution:
         solution = solve(qps._replace(G=row, l=none, u=none, w=none))
         return solution._replace(lam=solution.lam[:, 1:])
     form = BatchedQPs.of(qps)
-    best, todo = Best.initial(form), torch.arange(len(form), device=qps.g.device)
-    point = _begin(form)
+    point, todo = _begin(form), torch.arange(len(form), device=qps.g.device)
+    unsolved = torch.full_like(form.cost, torch.inf)
+    best = Best(torch.zeros_like(form.g), torch.zeros_like(form.w), unsolved, point.steps.clone())
     for target, limit in TARGETS:
         if not len(todo):
             break
