@@ -18,6 +18,7 @@ import torch
 from hydra._internal.core_plugins.importlib_resources_config_source import (
     ImportlibResourcesConfigSource,
 )
+from hydra._internal.hydra import Hydra
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf, _utils, base, grammar_parser
 
@@ -94,6 +95,8 @@ def quick_configurations() -> Iterator[None]:
             patch.setattr(module, "parse", parse)
         for name in ("is_config", "is_group"):
             patch.setattr(ImportlibResourcesConfigSource, name, once_a_path(name))
+        # No configuration has a mode; Hydra composes it once more to look.
+        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
         yield
 
 

@@ -295,7 +295,7 @@ def test_large_estimates_leave_the_same_input_of_each_step():
     mpc = qm.LinearMPC((A, B, C), 8, Q=1.0, R=0.01, dR=0.1, **bounds)
     controller, twin = exported(lambda: qm.Controller(mpc))
     size, largest = len(controller.observer.F), 0.0
-    for k in range(200):
+    for k in range(100):
         y, r = rng.normal(size=1) * (10 if k % 10 == 0 else 1), rng.normal(size=1)
         if k:
             state = np.concatenate((controller.x, controller.w, controller.u))

@@ -101,7 +101,7 @@ def test_c_keeps_the_same_limits(references):
     controller, twin = exported(plant, references=references, du_bounds=(-0.5, 0.5))
     rng, signals, codes, x = np.random.default_rng(0), wild(100, 1), set(), np.zeros(2)
     r = np.zeros((N + 1 if references == "preview" else 1, 2))
-    for k in range(120):
+    for k in range(80):
         if k % 40 == 0:
             r[:] = rng.uniform(-3, 3, 2)
         known = signals[k : k + N + 1].copy()

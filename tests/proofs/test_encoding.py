@@ -47,7 +47,7 @@ def test_the_encoding_has_the_policy_as_its_only_solution(case, structure):
     mpc = scheme(structure, **CASES[case])
     tables = make_tables(mpc)
     generator = np.random.default_rng(1)
-    states = np.concatenate((generator.uniform(BOX.lower, BOX.upper, (2, 2)), np.zeros((1, 2))))
+    states = np.concatenate((generator.uniform(BOX.lower, BOX.upper, (1, 2)), np.zeros((1, 2))))
     for state in states:
         program = Program()
         p = program.add(state, state)

@@ -94,7 +94,7 @@ def test_compiled_by_inductor_equals_eager():
     assert_close(outcome(mpc, compiled, s, s), outcome(mpc, value, s, s))
 
 
-@pytest.mark.parametrize("name", ["value", "policy"])
+@pytest.mark.parametrize("name", ["value", pytest.param("policy", marks=pytest.mark.slow)])
 def test_batch_sizes_and_updates_of_theta_do_not_compile_again(name):
     mpc, counter = random_mpc(3), CompileCounter()
     function = functions(mpc)[name]

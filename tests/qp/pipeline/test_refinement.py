@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.campaign.families import Draw, parallel_rows
+from tests.campaign.families import Case, Draw, parallel_rows
 from tests.problems import known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline import refinement
@@ -39,9 +40,14 @@ def test_the_value_does_not_depend_on_the_plants_unit(solver, unit):
     assert solution.value_error <= 1e-6
 
 
+@functools.cache
+def parallel(seed: int) -> Case:
+    return parallel_rows(Draw(seed), 16)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_nearly_parallel_rows_have_the_value_of_exact_arithmetic(solver, seed):
-    case = parallel_rows(Draw(seed), 16)
+    case = parallel(seed)
     solution = solve_qp(case.known.qp, solver=solver)
     assert_close(solution.value, case.known.value, rtol=1e-6, atol=1e-7)
 
