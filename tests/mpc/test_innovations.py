@@ -175,7 +175,7 @@ def test_outputs_that_stay_in_a_trajectory_are_known_to_the_others():
         assert np.square(xi[:, 0] - y[:, 0]).mean() < 0.05
 
 
-def test_the_order_is_that_of_the_least_held_out_errors():
+def test_order_and_lags_are_those_of_the_least_held_out_errors():
     data = noisy(20, 60)
     fit = fit_state_space(data)
     best = min(row.score for row in fit.candidates)

@@ -55,9 +55,10 @@ CORRELATIONS = 20
 
 
 class Candidate(NamedTuple):
-    """An order, and the mean logarithm of held-out squared errors of unit variances."""
+    """An order and lags, and the mean logarithm of held-out squared errors of unit variances."""
 
     order: int
+    lags: int
     score: float
 
 
@@ -100,35 +101,34 @@ def fit_state_space(
 ) -> Fit:
     """Fit an innovations form to a log, whose first states are the outputs.
 
-    The order has the least multi-step errors in parts of the log that a fit has not seen; of orders
-    that are nearly as good, it is the smallest.
+    Order and lags have the least multi-step errors in parts of the log that a fit has not seen; of
+    orders that are nearly as good, the smallest.
 
     Args:
         trajectories: the log; outputs that are NaN were not measured.
         order: states of the likelihood's model; 0 for the outputs alone, each measured exactly.
             The innovations form has more if the outputs are not independent functions of them.
-        lags: lags of the ARX model of the start; by default the most for which there are data,
-            as its ridge keeps what they do not show small.
+        lags: lags of the ARX model of the start.
     """
     normal = _Normal(trajectories)
     data, rows = normal.apply(trajectories), ()
-    if lags is None:
-        lags = _most_lags(data) if order != 0 else 0
-    if order is None:
+    if order is None or (lags is None and order):
+        orders = ORDERS if order is None else (order,)
+        feasible = _feasible(data) if lags is None else (lags,)
         short = [
             one.between(first, min(first + LONG, one.steps))
             for one in trajectories
             for first in range(0, one.steps, LONG)
         ]
         parts = [normal.apply(part) for part in folds(short, PARTS)]
-        rows = tuple(_compare(parts, lags))
-        order = _best(rows).order
-    if order and lags:
-        par = em(_states(_predictor(data, lags), order), data, MANY)
+        rows = tuple(_compare(parts, orders, feasible, order is None))
+        order, lags = _best(rows)[:2]
+    if order:
+        par = em(_states(_predictor(data, lags or 0), order), data, MANY)
         model = readable(steady(par), data)
     else:
-        model, order = measured(data), 0
-    return Fit(normal.restore(model), order, lags, rows)
+        model = measured(data)
+    return Fit(normal.restore(model), order, lags or 0, rows)
 
 
 def held_out_errors(
@@ -212,32 +212,37 @@ def _errors(
 # The choice
 
 
-def _most_lags(data: Sequence[Signals]) -> int:
-    """Return the most lags whose windows are in at least half of the steps, else 0."""
+def _feasible(data: Sequence[Signals]) -> tuple[int, ...]:
+    """Return the lags whose windows are in at least half of the steps."""
     total = sum(len(v) for _, v in data)
     usable = {p: sum(max(len(v) - p, 0) for _, v in data) for p in LAGS}
     width = data[0].y.shape[1] + data[0].v.shape[1]
-    return max((p for p in LAGS if usable[p] >= max(total / 2, 2 * width)), default=0)
+    return tuple(p for p in LAGS if usable[p] >= max(total / 2, 2 * width))[-3:]
 
 
-def _compare(parts: list[list[Signals]], lags: int) -> list[Candidate]:
-    """Return the orders with their scores, 0 first: the outputs without a filter."""
+def _compare(
+    parts: list[list[Signals]], orders: Sequence[int], lags: Sequence[int], alone: bool
+) -> list[Candidate]:
+    """Return the candidates with their scores; ``alone`` are the outputs without a filter, too."""
     folds = [
         ([x for j, p in enumerate(parts) if j != i for x in p], _batches(part))
         for i, part in enumerate(parts)
     ]
-    rows = [Candidate(0, _score([measured(data) for data, _ in folds], folds))]
-    if not lags or rows[0].score <= np.log(EXACT) + MARGIN:
-        return rows
-    starts, misses = [_predictor(data, lags) for data, _ in folds], 0
-    best = np.inf
-    for n in ORDERS:
-        if n <= min(len(start.s) for start in starts) and misses < PATIENCE:
-            pairs = zip(starts, folds, strict=True)
-            models = [steady(em(_states(start, n), data, FEW)) for start, (data, _) in pairs]
-            rows.append(Candidate(n, _score(models, folds)))
-            misses = 0 if rows[-1].score < best - MARGIN else misses + 1
-            best = min(best, rows[-1].score)
+    rows = []
+    if alone or not lags:
+        rows.append(Candidate(0, 0, _score([measured(data) for data, _ in folds], folds)))
+        if rows[0].score <= np.log(EXACT) + MARGIN:
+            return rows
+    for p in lags:
+        starts = [_predictor(data, p) for data, _ in folds]
+        best, misses = np.inf, 0
+        for n in orders:
+            if n <= min(len(start.s) for start in starts) and misses < PATIENCE:
+                pairs = zip(starts, folds, strict=True)
+                models = [steady(em(_states(start, n), data, FEW)) for start, (data, _) in pairs]
+                rows.append(Candidate(n, p, _score(models, folds)))
+                misses = 0 if rows[-1].score < best - MARGIN else misses + 1
+                best = min(best, rows[-1].score)
     return rows
 
 
@@ -255,7 +260,7 @@ def _score(models: list[Innovations], folds: list) -> float:
 
 def _best(rows: Sequence[Candidate]) -> Candidate:
     limit = min(row.score for row in rows) + MARGIN
-    return min((row for row in rows if row.score <= limit), key=lambda row: row.order)
+    return min((row for row in rows if row.score <= limit), key=lambda row: (row.order, row.score))
 
 
 # Normalised signals
