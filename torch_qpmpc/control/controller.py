@@ -41,19 +41,19 @@ class Controller:
 
     Args:
         mpc: the MPC. Call `reset` when its theta has changed.
-        noise: standard deviations of the noise of outputs, as a number, a vector or by name; by
-            default those of the identification. Without one, a tenth of half the distance of the
-            outputs' bounds, or without bounds of the deviation that costs one, ``1 / sqrt(Q)``.
-        drift: standard deviations of the change of each disturbance in a step; by default what
-            moves an output within the horizon by its identified noise. Without one, a tenth of half
-            the distance of the bounds of the output or the input. A larger ratio of drift to noise
-            rejects disturbances faster and passes on more noise.
+        noise: standard deviations of the outputs' noise, as a number, a vector or by name; by
+            default the identification's. Without one, a tenth of half the distance between the
+            output's bounds or, without bounds, of the deviation that costs one, ``1 / sqrt(Q)``.
+        drift: standard deviations of each disturbance's change in a step; by default the change
+            that moves an output by its identified noise within the horizon. Without one, a tenth of
+            half the distance between the bounds of the output or the input. A larger ratio of drift
+            to noise rejects disturbances faster and passes on more noise.
 
     Attributes:
         mpc: the MPC.
         observer: the `Observer`.
         max_plausible: the largest sizes of outputs and set-points, ``(n_y,)``, and of known
-            signals, ``(n_d,)``: larger ones are errors; see `torch_qpmpc.control.observer`.
+            signals, ``(n_d,)``; larger values count as errors: see `torch_qpmpc.control.observer`.
         x, w, u: the estimates of x and w, and the last input.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         r: the set-points of the last step, without rows before the first.
@@ -84,14 +84,14 @@ class Controller:
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
         """Forget the past: the plant rests with the outputs y.
 
-        Without them its state may be any of those in the model's log; without a log it rests with
-        the next step's outputs. `simulate` and `learn` start from rest, too. If the plant does not
-        rest, pass its last input.
+        Without y, its state may be any state in the model's log; without a log it rests with the
+        next step's outputs. `simulate` and `learn` also start from rest. If the plant moves, pass
+        only its last input.
 
         Args:
             y: outputs, by name or as a vector.
             u: the input that holds the plant there, by default zero; it is clipped into the bounds.
-                It is the last input that moves are counted from.
+                The next move is counted from it.
             known: known signals, as in `step`.
 
         Raises:
@@ -162,11 +162,11 @@ class Controller:
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
         """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.
 
-        It raises for no value of a signal: the estimates go on, and `status` says what was found.
+        No value of a signal raises: the estimates go on, and `status` says what happened.
 
         Args:
-            y: outputs, by name or as a vector ``(n_y,)``. One that is None, NaN or above
-                `max_plausible` is missing, all are if y is None: its prediction takes its place.
+            y: outputs, by name or as a vector ``(n_y,)``; None if all are missing. An output that
+                is None, NaN or above `max_plausible` is missing, and its prediction replaces it.
             r: set-points in the same forms, by default the last ones; with a preview also rows for
                 the stages 0, .., N; the last one is held.
             known: known signals for the stages 0, .., N, as a DataFrame or a mapping of columns
@@ -191,13 +191,13 @@ class Controller:
         return move.u.copy()
 
     def observe(self, y: Any, u: Any, known: Any = None) -> None:
-        """Take note of a step in manual mode, in which another input than this one's was applied.
+        """Record a step in manual mode, in which another input than this controller's was applied.
 
-        The next `step` moves from it, with estimates that have followed: without a bump.
+        The estimates follow, and the next `step` moves from that input: without a bump.
 
         Args:
             y: outputs, as in `step`.
-            u: the input that was applied, by name or as a vector ``(m,)``. The last one stands for
+            u: the input that was applied, by name or as a vector ``(m,)``. The last input replaces
                 an entry that is None, NaN or absurd.
             known: the known signals of this step, in the forms of `step`.
 
@@ -212,7 +212,7 @@ class Controller:
     def redesign(self, **changes: Any) -> None:
         """Change bounds and weights between two steps; the estimates and the last input stay.
 
-        The observer stays, too; it follows from the bounds that the controller was made with.
+        The observer also stays: it follows from the bounds that the controller was made with.
 
         Args:
             changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
@@ -235,7 +235,7 @@ class Controller:
         self._memory = self._memory._replace(u=u)
 
     def save(self, path: str | Path) -> None:
-        """Write this controller with its estimates and last input to ``path``; no code is in it.
+        """Write this controller, its estimates and its last input to ``path``, without code.
 
         Raises:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
@@ -247,7 +247,7 @@ class Controller:
 
     @classmethod
     def load(cls, path: str | Path) -> Controller:
-        """Return the controller that `save` wrote to ``path``; it goes on from where that was.
+        """Return the controller that `save` wrote to ``path``; it goes on where that one was.
 
         Raises:
             QPError: the file is missing or damaged, of another kind or a newer release, or holds
@@ -267,9 +267,9 @@ class Controller:
     def simulate(self, plant: Any = None, steps: int = 200, r: Any = None, **options: Any) -> Run:
         """Return a closed loop of a copy of this controller with a plant, from rest.
 
-        The last `reset` says where: a model starts as near to rest with its input, the first known
-        signals and its outputs as it can; an environment starts where its own reset says, and the
-        estimates start from any state of the model's log; without one, from rest with that input.
+        A model starts as near as it can to rest with the last `reset`'s input and outputs and the
+        first known signals. An environment starts where its own reset says, and the estimates start
+        from any state of the model's log or, without one, from rest with that input.
 
         Args:
             plant: a model as `LinearMPC` takes it, by default its own; or an environment with
@@ -301,12 +301,12 @@ class Controller:
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
 
-        The design's own cost, `Run.costs`, must be shown to fall by 1 %. Then the controller starts
-        again with the new model, from rest with its last input; otherwise it stays as it is. Loops
-        start where the last `reset` rests; with a log's model, at rest in the middle of the
-        set-points; with an environment, where its own reset says. Without a log the filter takes a
-        start that is not at rest for a disturbance, until it has settled. On a terminal a bar shows
-        the progress.
+        The loops must show that the design's own cost, `Run.costs`, falls by 1 %. Then the
+        controller starts again with the new model, from rest with its last input; otherwise it
+        stays as it is. Loops start where the last `reset` rests; with a log's model, at rest in the
+        middle of the set-points; with an environment, where its own reset says. Without a log the
+        filter takes a start that is not at rest for a disturbance, until it has settled. On a
+        terminal a bar shows the progress.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
@@ -357,9 +357,9 @@ class Controller:
 
         Args:
             log: a log of its signals, as `read_log` reads it. Loops start at its steps within the
-                outputs' bounds, from where its known signals go on.
+                outputs' bounds and replay its known signals from there.
             r, spread: set-points, as in `learn` for a log.
-            options: others of `torch_qpmpc.improve` than ``cost``.
+            options: arguments of `torch_qpmpc.improve`, except ``cost``.
 
         Raises:
             QPError: an argument is invalid, the log determines no model, or the MPC learns nothing.
@@ -373,7 +373,7 @@ class Controller:
     ) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.
 
-        They are about the cost, the terminal weight, the gains, the horizon, the disturbances, the
+        They cover the cost, the terminal weight, the gains, the horizon, the disturbances, the
         scaling of signals, hard bounds that can leave no plan, the reach of set-points, the QP's
         condition, the loop without active bounds (its stability, margin and offset), the shares of
         weights in the cost of a closed loop, and the C code's size and iterations.
@@ -412,12 +412,12 @@ class Controller:
         """Write this controller as C99 without heap or dependencies.
 
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
-        input and the active sets of all QPs in the state. A closed loop is compared with this
-        one's if a C compiler is installed. ``main.c`` and a ``Makefile`` run the closed loop with
-        the model as a plant. It starts where the last `reset` rests, or else in the
-        middle of the bounds, and goes to the last set-point, or to one near the start. Both files
-        are written once, and yours afterwards: the report names those that were kept, and an older
-        ``main.c`` does not compile with a controller of other sizes.
+        input and the active sets of all QPs in the state. With a C compiler, a closed loop is
+        compared with this controller's. ``main.c`` and a ``Makefile`` run the closed loop with the
+        model as a plant. It starts where the last `reset` rests, or else in the middle of the
+        bounds, and goes to the last set-point, or to one near the start. A later export keeps both
+        files as yours, and its report names them; an old ``main.c`` does not compile with a
+        controller of other sizes.
 
         Args:
             folder: the folder of the files, created if it does not exist.

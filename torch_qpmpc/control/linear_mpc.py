@@ -70,14 +70,14 @@ class LinearMPC(Affine):
             default. Bounds of inputs and moves are hard. A bound of an output or input may be the
             name of a known signal that acts on no state: it then varies over the horizon.
         y_slack: the price of a unit of violation of an output's bounds; inf makes them hard. By
-            default a violation by half the distance of the bounds costs 1000 times as much as a
-            stage with all signals that far off the target.
+            default a violation by half the distance between the bounds costs 1000 times a stage
+            with all signals that far off the target.
         linear: price times input, as a mapping from inputs to numbers or names of known signals.
         references: ``"held"``: one r for the plan. ``"preview"``: one for each stage.
-        disturbances: those that an observer estimates, by default one for each output; see
+        disturbances: the ones that an observer estimates, by default one for each output; see
             `torch_qpmpc.control.disturbance.choose`.
         blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
-            ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves are then those between blocks.
+            ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves then hold between blocks.
         gamma: the discount.
         options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of `QPMPC`; by
             default a tied structure that learns nothing, and DAQP.
@@ -235,8 +235,8 @@ class LinearMPC(Affine):
     def target(self, r: Any, w: Any = 0.0, known: Any = None) -> Target:
         """Return the steady states within the bounds that are nearest to set-points.
 
-        The inputs exceed their bounds as little as possible if no steady state of a plant that
-        integrates is within them. All arguments are differentiable.
+        If a plant that integrates has no steady state within the bounds, the inputs exceed them as
+        little as possible. All arguments are differentiable.
 
         Args:
             r: ``(*batch, n_y)``.

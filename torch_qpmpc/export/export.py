@@ -123,7 +123,7 @@ def export_c(
     """Write the policy and value of the current theta as C99 without heap or dependencies.
 
     The files are ``name.c`` and ``name.h``, whose ``name_step`` maps p to u_0 and V(p); they are
-    compared with an exact solver, at states about feasible ones, if a C compiler is installed.
+    compared with an exact solver, at states near feasible ones, if a C compiler is installed.
 
     Args:
         mpc: the QP.
@@ -247,12 +247,12 @@ def check_name(name: str) -> None:
 class CompiledPolicy:
     """The policy and value of a QPMPC in compiled C, for fast closed loops.
 
-    It holds the theta of its creation. Each row of a batch is a controller that starts from its own
+    It keeps its first theta. Each row of a batch is a controller that starts from its own
     last active set, so that a closed loop of B plants passes ``(B, n_p)`` at each step.
 
     Args:
-        mpc: the QPMPC; its ``on_failure`` is that of the policy: ``"raise"`` raises on a step that
-            is not solved, and others return the action that C writes.
+        mpc: the QPMPC. With its ``on_failure="raise"`` a step that is not solved raises; otherwise
+            the policy returns the action that C writes.
         dtype, storage, max_iterations: as in `export_c`.
 
     Attributes:

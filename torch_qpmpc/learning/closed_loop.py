@@ -390,11 +390,11 @@ def improve(
 ) -> Improvement:
     """Move theta along the gradient of the cost of closed loops, and keep it if they cost less.
 
-    The loss is the undiscounted mean cost of a step. Adam moves the learned parts of ``mpc``, each
-    entry in the unit that the signals of its first loops give it, at a rate that falls to zero. The
-    new theta is kept if `PairedTest` finds that it costs less in loops that it has not learned
-    from; otherwise ``mpc`` is as before. A loop in which a QP has no certified solution costs
-    infinitely much, and an update with one is skipped.
+    The loss is the undiscounted mean cost of a step. Adam moves the learned parts of ``mpc`` at a
+    rate that falls to zero; the signals of the first loops set the unit of each entry. The new
+    theta is kept if `PairedTest` finds that it costs less in unseen loops; otherwise ``mpc`` stays
+    as it was. A loop in which a QP has no certified solution costs infinity, and an update with
+    such a loop is skipped.
 
     Args:
         mpc: the policy, with ``learn`` and ``structure`` of its own.
@@ -408,7 +408,7 @@ def improve(
         rate: the first rate of Adam, in units of the signals.
         held_out: the number of loops that decide.
         members: the number of models of an identified plant: the log's, and those of trajectories
-            drawn with replacement. Of a single trajectory there is one.
+            drawn with replacement. A single trajectory has one.
         cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
             plant; by default the `stage_cost` of the scheme.
         penalty: maps ``mpc`` to a term that is added to the mean cost of a step, such as

@@ -124,7 +124,7 @@ class SystemIdentificationPenalty(nn.Module):
     """The system-identification (SI) penalty ``beta sum_i ||C tau_i - b||^2`` (eq:sdp3).
 
     C and b have a gauge: T C and T b are the same QP for any invertible T, so that shrinking them
-    lowers the penalty. Of pairs of windows it takes the difference of their errors, which is white
+    lowers the penalty. For pairs of windows it takes the difference of their errors, which is white
     if the noise is a random walk.
 
     Args:

@@ -22,14 +22,14 @@ from torch_qpmpc.mpc.parameters import check_names
 class ThetaNetwork(TensorDictModuleBase):
     """A network from p to residuals of theta, an upstream module for ``theta_keys``.
 
-    Each residual is ``size * tanh(..)``. The last layer starts at zero, so that the QP is first the
-    one of ``mpc`` alone.
+    Each residual is ``size * tanh(..)``. The last layer starts at zero, so the first QP is
+    ``mpc``'s own.
 
     Args:
         mpc: the QPMPC; only the shapes of its coordinates are used.
         sizes: the bounds of the residuals by their names in `QPMPC.coordinates`, such as
             ``{"q": 1.0, "b": 0.1}``. Residuals of vectors (q, c, b, lb, ub) are cheap. Those of
-            matrices (H, H_f, C, G) need one factorisation per QP, ten and more times the time.
+            matrices (H, H_f, C, G) need one factorisation per QP: ten times as long or longer.
         width: units in each of the two hidden layers.
         in_keys: the keys of the inputs, which are concatenated; by default the keys of p.
         n_in: the number of their entries; by default n_p.

@@ -152,7 +152,7 @@ def identify_blended(
         trajectories: as in `identify`, without known signals.
         horizon: the number of steps over which predictions decide on the number of centres.
         centres: the number of centres; or several, among which the last fifth of the log decides.
-            Those with more coefficients than the log has transitions are left out.
+            Numbers with more coefficients than the log has transitions are left out.
 
     Raises:
         QPError: an argument is invalid, the log has known signals, or does not determine a linear

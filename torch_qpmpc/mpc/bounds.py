@@ -35,8 +35,8 @@ class Bounds:
         terminal_constraints: the same for x_N, with D^f ``(m_f, n_x)``, or for [d_N; x_N].
         state_slack, action_slack, constraint_slack: the slack weights w of the rows of states, of
             actions, and of mixed and terminal constraints; ``inf`` makes them hard. By default,
-            actions are hard and the others soft. Pass one weight or one per entry, for
-            ``constraint_slack`` of the rows of D and then of D^f.
+            actions are hard and the others soft. Pass one weight, or one per entry; for
+            ``constraint_slack`` one per row of D, then of D^f.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
 
     Raises:

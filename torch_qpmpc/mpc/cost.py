@@ -32,14 +32,14 @@ class Cost:
             price p times u_k is an entry 1 in both of their cross blocks.
         terminal_weight: H_f, ``(n_x,)`` or ``(n_x, n_x)``, or of [d_N; x_N]. ``"riccati"``: the
             cost to go of the linear quadratic regulator of A, B and the stage weight, about the x
-            of least stage cost for d_N; not for a diagonal hessian. By default it is that if it
-            exists, for one dense stage, and no q; else the stage's own weight. With a random
-            stage weight it is the identity.
+            of least stage cost for d_N; not for a diagonal hessian. This is the default if it
+            exists, for one dense stage weight and no q; else the stage's own weight is. With a
+            random stage weight it is the identity.
         hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
         q, c: the linear cost ``(n_z,)`` and the constant, without discounts; zero by default.
 
     Raises:
-        QPError: an entry is not finite, or ``hessian`` or ``terminal_weight`` is no choice.
+        QPError: an entry is not finite, or ``hessian`` or ``terminal_weight`` is unknown.
 
     Example:
         >>> import torch_qpmpc as qm

@@ -161,7 +161,7 @@ def identify(
             different lengths.
         horizon: N, the number of steps of the predictions that are reported.
         order: the number of states; by default errors of held-out predictions choose it. 0: the
-            outputs, each measured exactly.
+            state is the outputs, measured exactly.
         n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
             they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``; all of them by default.

@@ -126,7 +126,7 @@ def read_log(
     Args:
         data: the path of a CSV file, a DataFrame, a mapping of arrays ``(T,)`` or ``(T, n)``, or a
             list of these, one for each episode; or steps as in `identify`. A unit in a header, as
-            in ``T [degC]``, is not part of the name. Arrays shorter by one row lack the last.
+            in ``T [degC]``, is not part of the name. A shorter array lacks the last row.
         outputs, inputs, known: the columns of y, u and, optionally, d; by default ``y``, ``u`` and
             ``d`` or ``y1``, ``y2``, .. and so on.
         time: the column of times: numbers, dates, periods or time differences; by default a

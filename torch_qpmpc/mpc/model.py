@@ -17,8 +17,8 @@ from torch_qpmpc.mpc.validation import owned
 class Model:
     """The model x+ = A x + B u + E d + offset that the constraints ``C z = b`` start from.
 
-    A and B that are None are drawn at random: A is the identity plus, and B is, normal entries with
-    standard deviation 0.1. A discrete system of scipy or python-control whose states are measured
+    If A or B is None, its entries are drawn at random, normal with standard deviation 0.1, and A
+    adds the identity. A discrete system of scipy or python-control whose states are measured
     has such matrices: ``Model(system.A, system.B)``.
 
     Args:
@@ -26,7 +26,7 @@ class Model:
         B: ``(n_x, n_u)``, or one per stage.
         E: the factor of the preview d_k, ``(n_x, n_d)``, or one per stage; zero by default.
         offset: ``(n_x,)``; zero by default.
-        C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, as of a multi-step predictor, in place of the
+        C, b: ``(N n_x, n_z)`` and ``(N n_x,)``, such as a multi-step predictor's, in place of the
             model's.
 
     Raises:

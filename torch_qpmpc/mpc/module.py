@@ -87,9 +87,8 @@ class QPMPC(nn.Module):
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
-        schedule: a model, as of `identify_blended`, or its arguments, whose linearisation at s
-            takes the place of the scheme's model: the differences of its C(s) and b(s) from the
-            scheme's are added to theta's.
+        schedule: a model from `identify_blended`, or its arguments. Its linearisation at s replaces
+            the scheme's model: theta gets the differences of C(s) and b(s) from the scheme's.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -190,7 +189,7 @@ class QPMPC(nn.Module):
     def of(cls, n_x: int, n_u: int, horizon: int, n_d: int = 0, **options: Any) -> Self:
         """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
 
-        A `UserWarning` tells of a random start when the policy first acts.
+        A `UserWarning` reports a random start when the policy first acts.
 
         Args:
             n_x, n_u, horizon, n_d: see `Layout`.
@@ -231,8 +230,8 @@ class QPMPC(nn.Module):
     ) -> Self:
         """Return a QPMPC whose model is fitted to logged trajectories, with the outputs as state.
 
-        For a state that the outputs show in part, `identify` a model: its ``arguments`` are those
-        of `of`, and a `torch_qpmpc.envs.KalmanFilter` estimates the state. Without ``stage_weight``
+        If the outputs show only a part of the state, `identify` a model: pass its ``arguments`` to
+        `of`, and let a `torch_qpmpc.envs.KalmanFilter` estimate the state. Without ``stage_weight``
         the cost is fitted to the rewards of the log, with a warning if it explains them poorly. It
         is dense unless ``hessian="diagonal"`` is passed.
 
@@ -453,7 +452,7 @@ class QPMPC(nn.Module):
 
     @torch.no_grad()
     def project_(self) -> None:
-        """Project H, H_f and w in place to where they are >= 0, the end of a step (eq:sdp1).
+        """Make H, H_f and w non-negative in place by projection, after a step (eq:sdp1).
 
         Call it after each step of an optimiser; `GaussNewton` does so itself. With
         ``step="cholesky"`` it does nothing.
@@ -468,7 +467,7 @@ class QPMPC(nn.Module):
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
-        It leaves out the schedule, whose change at s each solve adds.
+        It leaves out the schedule, which each solve adds at its s.
 
         Args:
             residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
@@ -493,10 +492,10 @@ class QPMPC(nn.Module):
             return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
 
     def coordinates(self) -> dict[str, Tensor]:
-        """Return the unconstrained coordinates of theta, those that residuals move, by name.
+        """Return the unconstrained coordinates of theta, which residuals move, by name.
 
-        They are the parts, or what learned parts are computed from: factors of H, H_f and w, the
-        shorter vectors of tied parts, and A, B, E and D, D_f of a tied C and G.
+        They are the parts themselves or, behind learned parts, factors of H, H_f and w, the shorter
+        vectors of tied parts, and A, B, E and D, D_f of a tied C and G.
         """
         return parameters.coordinates(self)
 

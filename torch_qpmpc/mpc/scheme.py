@@ -40,7 +40,7 @@ class Scheme:
         cost: the weights; drawn at random by default.
         bounds: no bounds by default.
         gamma: discount of the stage costs, 0 < gamma <= 1.
-        seed: the seed of what is drawn.
+        seed: the seed of random parts.
 
     Raises:
         QPError: a part is of another type, or does not match the sizes; or the cost is not convex.

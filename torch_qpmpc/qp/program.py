@@ -104,7 +104,7 @@ class QuadraticProgram:
         lb: lower bounds, ``(*batch, n_g)``; ``-inf`` where there is none.
         ub: upper bounds, ``(*batch, n_g)``; ``inf`` where there is none.
         w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
-        check_values: check the values, too (finite, H symmetric and positive semidefinite,
+        check_values: also check the values (finite, H symmetric and positive semidefinite,
             lb <= ub, w >= 0). `QPMPC` passes ``False``: its parametrisations guarantee them, and
             the solve detects values that training has made invalid.
         n_known: the number of leading entries of z that each solve fixes: only the block of H
