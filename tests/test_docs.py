@@ -47,8 +47,9 @@ def test_blocks_are_found():
     assert commands(text) == [["ls", "-l"]]
 
 
-#: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs.
-SLOW = [f"docs/guides/{name}.md" for name in ("torchrl", "environment", "prove")]
+#: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs,
+#: and the tests of `improve` have shorter loops.
+SLOW = [f"docs/guides/{x}.md" for x in ("torchrl", "environment", "prove", "closed-loops")]
 
 
 @pytest.mark.parametrize(

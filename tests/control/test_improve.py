@@ -63,7 +63,7 @@ def loops(controller: qm.Controller) -> learning.ControlledPlant:
 
 @pytest.mark.parametrize("case", CASES)
 def test_its_gradient_is_that_of_finite_differences(case):
-    """Through the observer, the target and the QP, along structured and random directions."""
+    """Through the observer, the target and the QP, along random directions."""
     controller = made(case)
     mpc, plant = controller.mpc, loops(controller)
 
@@ -75,21 +75,20 @@ def test_its_gradient_is_that_of_finite_differences(case):
     for name, leaf in mpc.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:
             continue
-        noise = torch.randn(leaf.shape, generator=generator).double()
-        for direction in (leaf.detach().clone(), noise * leaf.detach().abs()):
-            direction = direction.nan_to_num(posinf=0.0, neginf=0.0)
-            if not (size := direction.norm()) > 0:
-                continue
-            direction, step, ends = direction / size, 1e-5, []
-            with torch.no_grad():
-                for sign in (1, -1):
-                    leaf.add_(sign * step * direction)
-                    ends.append(cost())
-                    leaf.sub_(sign * step * direction)
-            expected = (ends[0] - ends[1]) / (2 * step)
-            got = (leaf.grad * direction).nan_to_num().sum()
-            torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5, msg=name)
-            moved |= {name} if abs(got) > 1e-3 else set()
+        direction = torch.randn(leaf.shape, generator=generator).double() * leaf.detach().abs()
+        direction = direction.nan_to_num(posinf=0.0, neginf=0.0)
+        if not (size := direction.norm()) > 0:
+            continue
+        direction, step, ends = direction / size, 1e-5, []
+        with torch.no_grad():
+            for sign in (1, -1):
+                leaf.add_(sign * step * direction)
+                ends.append(cost())
+                leaf.sub_(sign * step * direction)
+        expected = (ends[0] - ends[1]) / (2 * step)
+        got = (leaf.grad * direction).nan_to_num().sum()
+        torch.testing.assert_close(got, expected, rtol=1e-3, atol=1e-5, msg=name)
+        moved |= {name} if abs(got) > 1e-3 else set()
     assert len(moved) >= 3
 
 

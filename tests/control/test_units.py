@@ -154,10 +154,10 @@ def test_bounds_of_outputs_and_known_signals_in_far_units_change_no_input(tmp_pa
             dR=0.1 / u**2, u_bounds=(-u, u), y_bounds=(-2 * y, 2 * y), **options
         )  # fmt: skip
         controller, x, inputs = qm.Controller(mpc), 0.0, []
-        for k in range(40):
-            move = controller.step([x], [2.5 * y * (k > 5)], [2 * d * (k > 20)])
+        for k in range(24):
+            move = controller.step([x], [2.5 * y * (k > 2)], [2 * d * (k > 12)])
             inputs.append([move[0] / u, controller.status])
-            x = 0.9 * x + 0.5 * y / u * move[0] + 0.2 * y * (k > 20)
+            x = 0.9 * x + 0.5 * y / u * move[0] + 0.2 * y * (k > 12)
         found.append(inputs)
     assert controller.export_c(tmp_path).difference is not None
     assert np.allclose(*found, atol=1e-7)

@@ -198,7 +198,7 @@ def test_known_signals_go_on_as_in_the_log(learn):
         assert torch.equal(plant._row(s)[:, 0], torch.minimum(before + 1, last))
         e = (plant.known(s)[:, 4] - 0.8 * p[:, 4] - p[:, 0]).std()
         assert 0.05 < e < 0.2
-    report = qm.improve(mpc, found, updates=4, loops=8, steps=20, held_out=32, members=2)
+    report = qm.improve(mpc, found, updates=2, loops=8, steps=20, held_out=16, members=2)
     assert np.isfinite([report.before, report.after, *report.curve]).all()
 
 
