@@ -30,6 +30,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Rank the guides above the reference and the notebooks, which have more words, in searches."""
+    if page.file.src_uri.startswith(("api/", "notebooks/")):
+        page.meta["search"] = {"boost": 0.1}
+    return html
+
+
 class Docstrings(griffe.Extension):
     """Read ``Example:`` as doctests, and ``A, B: ..`` as two parameters, which Griffe does not."""
 

@@ -71,7 +71,7 @@ BUDGET = {
     "experiment": 3320,
     "export": 1444,
     "learning": 2850,
-    "mpc": 5171,
+    "mpc": 5170,
     "proofs": 999,
     "qp": 5712,
     "study": 547,
