@@ -93,7 +93,7 @@ class RunFolder:
         finally:
             self.logger.close()
             if self.cfg.logger == "mlflow":
-                import mlflow
+                import mlflow  # pyright: ignore[reportMissingImports] - an extra
 
                 mlflow.end_run()  # which the logger does not
 
