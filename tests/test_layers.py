@@ -70,10 +70,10 @@ BUDGET = {
     "envs": 1445,
     "experiment": 3320,
     "export": 1444,
-    "learning": 2850,
-    "mpc": 5170,
+    "learning": 2798,
+    "mpc": 5111,
     "proofs": 999,
-    "qp": 5712,
+    "qp": 5663,
     "study": 547,
 }
 #: Libraries that only some layers may import.

@@ -35,7 +35,7 @@ from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.layout import banded_matrix
-from torch_qpmpc.mpc.projections import check_step, nearest_psd, nearest_psd_by_sdp
+from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.mpc.riccati import lqr_gain
 
 A2, B1 = tensor([[1.0, 0.1], [0, 0.9]]).double(), tensor([[0.0], [1.0]]).double()
@@ -95,12 +95,6 @@ def released_step() -> None:
     optimizer = qm.GaussNewton(tied)
     tied.release()
     optimizer.step(S, Aa, zeros(4))
-
-
-def transposed() -> None:
-    replay = R()
-    replay.extend(make_batch(3, 2))
-    replay.sample()
 
 
 def other_rows() -> None:
@@ -188,8 +182,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("windows: got shape (11, 6), expected shape (M, 11).", lambda: si(zeros(5, 11), mpc.C.mT)),
     ("C: got QPMPC, expected a floating-point torch.Tensor.", lambda: si(mpc, zeros(1, 11))),
     ("windows: got shape (2, 3, 11), expected shape (M,", lambda: si.curvature(zeros(2, 3, 11))),
-    ("batch: got list, expected a TensorDictBase. Pass the collector's", lambda: R().extend([1])),
-    ("batch: got shape (3, 2), expected (num_envs, T) with num_envs = 2. Transpose it", transposed),
     # Analysis
     ("C: got shape (11,), expected shape (*batch, N", lambda: prediction_form(zeros(11), 2, 1)),
     ("n_x: got 0, expected a whole number >= 1.", lambda: prediction_form(mpc.C_0, 0, 1)),
@@ -211,12 +203,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: local_gain(op, S)),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: policy_map(op, ones(2), ones(2))),
     ("s: got shape (3,), expected shape (*batch, 2).", lambda: local_gain(mpc, zeros(3))),
-    ("A: got list, expected a floating-point", lambda: lqr_gain([[1.0]], [[1.0]], [[1.0]])),
-    ("W: got shape (2, 2), expected shape (3, 3). Pass", lambda: lqr_gain(A2, B1, eye(2).double())),
-    ("A: got shape (2, 1), expected shape (2, 2).", lambda: lqr_gain(B1, A2, I3)),
-    ("gamma: got 2, expected a discount factor in (0, 1].", lambda: lqr_gain(A2, B1, I3, gamma=2)),
-    ("W: got smallest eigenvalue -1, expected a positive", lambda: lqr_gain(A2, B1, -I3)),
-    ("B: got shape (2,), expected shape (2, n_u).", lambda: lqr_gain(A2, B1[:, 0], I3)),
     ("terminal_weight: got a Riccati equation without a", lambda: lqr_gain(A2 * nan, B1, I3)),
     ("K: got shape (2, 1), expected shape", lambda: spectral_radius(A2, B1, zeros(2, 1).double())),
     ("A, B, K: got NaN or inf", lambda: spectral_radius(A2 * nan, B1, zeros(1, 2).double())),
@@ -224,9 +210,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("model: got tuple, expected a NearestModel. Pass", lambda: one_step_error((A2, B1), A2, B1)),
     ("offset: got shape (3,), expected", lambda: one_step_error(model, A2, B1, zeros(3).double())),
     ("moment: got shape (3, 3), expected", lambda: one_step_error(model, A2, B1, moment=eye(3))),
-    ("H: got shape (2,), expected shape (*batch, n, n).", lambda: nearest_psd(ones(2))),
-    ("H: got shape (2, 3), expected shape (*batch, n, 2).", lambda: nearest_psd(ones(2, 3))),
-    ("H: got torch.int64, expected a floating-point", lambda: nearest_psd_by_sdp(-eye(2).long())),
     ("step: got None, expected one of cholesky, projection, sdp.", lambda: check_step(None)),
     # Plants, closed loops and resuming
     ("s: got shape (32, 4), expected shape (*batch, 2).", lambda: closed_loop(mpc, pm)),

@@ -188,12 +188,6 @@ def test_a_restored_replay_equals_an_undisturbed_one(count):
         second.extend(batch)
 
 
-def test_a_flattened_batch_is_an_error():
-    batch = batches(1, 2, max_steps=50)[0]
-    with pytest.raises(QPError, match=r"batch: got shape \(16,\), expected \(num_envs, T\)"):
-        filled([], rows=40).extend(batch.reshape(-1))
-
-
 @pytest.mark.parametrize("capacity", [33, 24, 0])
 def test_bad_capacity_is_an_error(capacity):
     with pytest.raises(QPError, match=rf"capacity: got {capacity}, .* The smallest is 32\."):

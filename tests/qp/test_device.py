@@ -238,6 +238,7 @@ WAITS = {
     "qp/pipeline/arrays.py:on_device": "what follows from theta, prepared on the CPU",
     "qp/pipeline/arrays.py:to_numpy": "theta, to be prepared",
     "qp/pipeline/batch.py:Programs.valid": "finds NaN",
+    "qp/pipeline/condensing.py:condense": "theta, which is prepared on the CPU",
     "qp/pipeline/condensing.py:inverse_factors": "theta, which is prepared on the CPU",
     "qp/pipeline/solve.py:_solved": "counts",
     "qp/solvers/interior_point.py:settle": "the QPs that are not settled",

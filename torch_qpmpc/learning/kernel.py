@@ -5,8 +5,7 @@ With g_i = dQ(s_i, a_i)/dtheta and a metric D on theta, the step that minimises
     1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 
 is ``dtheta = D sum_i alpha_i g_i``, ``(K + mu I) alpha = delta``, ``K_ij = g_i'D g_j``, a system of
-the batch's size. mu is a fraction of the mean of K's diagonal. In a batch of more pairs than theta
-has entries, alpha follows from the smaller system of theta's size.
+the batch's size. mu is a fraction of the mean of K's diagonal.
 
 The gradients in a free C are the outer products chi_i z_i', so that ``K = (chi chi') * (z P z')``
 is computed without forming them. P is the metric of C's rows: D's or, with the SI penalty
@@ -61,14 +60,6 @@ class Dense:
         self.leaf, self.group, self.rows, self.scale = leaf, group, rows, 1.0
         self.units = torch.ones_like(leaf).flatten() if units is None else units
 
-    def width(self) -> float:
-        """Return n, or infinity with a penalty."""
-        return self.rows.shape[1]
-
-    def features(self) -> Tensor:
-        """Return Phi ``(B, n)`` of the kernel Phi Phi', without a penalty."""
-        return self.rows * (self.scale * self.units).sqrt()
-
     def diagonal(self) -> Tensor:
         """Return the kernel's diagonal without a penalty, ``(B,)``."""
         return self.scale * self.rows.square() @ self.units
@@ -115,14 +106,6 @@ class OuterProducts:
         self.rows, self.columns, self.S, self.b = rows, columns, S, b.unsqueeze(-1)
         self.drift = torch.zeros_like(leaf)
         self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
-
-    def width(self) -> float:
-        return self.leaf.numel() if self.S is None else math.inf
-
-    def features(self) -> Tensor:
-        chi, z = self.chi * self.rows.sqrt(), self.z * (self.scale / self.columns).sqrt()
-        parts = (torch.einsum("bi,bj->bij", chi[:, i], z[:, j]) for i, j, _ in self.patterns)
-        return torch.cat([chi[:, :0], *(part.flatten(1) for part in parts)], -1)
 
     def diagonal(self) -> Tensor:
         chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
@@ -231,20 +214,12 @@ def damping_of(blocks: Sequence[Block], damping: float) -> Tensor:
 def solve_dual(blocks: Sequence[Block], delta: Tensor, mu: Tensor) -> tuple[Tensor, Tensor]:
     """Solve the dual; return alpha ``(B,)`` and the step's predicted change of Q ``(B,)``."""
     drifted = sum((block.damp(mu) for block in blocks), torch.zeros_like(delta))
-    if 0 < sum(block.width() for block in blocks) < len(delta):
-        features = torch.cat([block.features() for block in blocks], -1)
-        change = features @ _solve(features.mT @ features, features.mT @ delta, mu)
-        return (delta - change) / mu, change
     K = sum((block.kernel() for block in blocks), delta.new_zeros(len(delta), len(delta)))
-    alpha = _solve(K, delta - drifted, mu)
+    # NaN if there is no Cholesky factor.
+    factor, failed = torch.linalg.cholesky_ex(K + mu * torch.eye(len(delta)).to(delta))
+    alpha = torch.cholesky_solve((delta - drifted).unsqueeze(-1), factor).squeeze(-1)
+    alpha = torch.where(failed == 0, alpha, math.nan)
     return alpha, K @ alpha + drifted
-
-
-def _solve(matrix: Tensor, right: Tensor, mu: Tensor) -> Tensor:
-    """Return ``(matrix + mu I)^-1 right`` ``(n,)``, or nan if there is no Cholesky factor."""
-    factor, failed = torch.linalg.cholesky_ex(matrix + mu * torch.eye(len(right)).to(right))
-    x = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
-    return torch.where(failed == 0, x, math.nan)
 
 
 def objective(errors: Tensor, blocks: Sequence[Block]) -> Tensor:

@@ -150,7 +150,10 @@ class QPQLearningLoss(LossModule):
         )
         self.register_buffer("reward_range", torch.tensor([torch.inf, -torch.inf]).double())
         # Not registered as a submodule, because its parameters are the value network's.
-        view = _in_place_of_last(self.value_network, self.operator.get_value_operator())
+        view: Any = self.operator.get_value_operator()
+        if isinstance(network := self.value_network, TensorDictSequential):
+            upstream: Any = network.module[:-1]
+            view = TensorDictSequential(*upstream, view)
         object.__setattr__(self, "state_value_network", view)
 
     @property
@@ -361,7 +364,9 @@ class QPQLearningLoss(LossModule):
         key = unravel_key(("next", self.tensor_keys.reward))
         reward = tensordict.get(key)
         invalid = invalid_rewards(reward, key)
-        next_value = self._next_value(tensordict)
+        value, _ = self._unbounded_value(tensordict)
+        # An infinite cost marks a QP without a solution.
+        next_value = torch.where(value.isfinite(), self._bounded(value), value)
         valid = reward.masked_fill(invalid, 0)
         target = self._estimate(tensordict, valid, next_value)
         target = torch.where(target.isfinite(), target, -torch.inf)
@@ -375,12 +380,6 @@ class QPQLearningLoss(LossModule):
         """Return the value estimates ``(*batch,)`` of the batch with these rewards."""
         batch = tensordict.copy().set(("next", self.tensor_keys.reward), reward)
         return self.value_estimator.value_estimate(batch, next_value=next_value).squeeze(-1)
-
-    def _next_value(self, tensordict: TensorDictBase) -> Tensor:
-        """Return -V(s+), clipped, ``(*batch, 1)``; zero after a termination."""
-        value, _ = self._unbounded_value(tensordict)
-        # An infinite cost marks a QP without a solution.
-        return torch.where(value.isfinite(), self._bounded(value), value)
 
     def _unbounded_value(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return -V(s+), zero after a termination, and True there, both ``(*batch, 1)``."""
@@ -419,11 +418,3 @@ def _call_with(
 def _last(network: Any) -> Any:
     """Return the last module of a sequence, or the module itself."""
     return network.module[-1] if isinstance(network, TensorDictSequential) else network
-
-
-def _in_place_of_last(network: Any, last: Any) -> Any:
-    """Return ``last``, or the sequence with ``last`` in place of its last module."""
-    if not isinstance(network, TensorDictSequential):
-        return last
-    upstream: Any = network.module[:-1]
-    return TensorDictSequential(*upstream, last)

@@ -21,7 +21,6 @@ from torchrl.data import (
     SliceSampler,
 )
 
-from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.subspace import EXACT
 from torch_qpmpc.qp.program import UNKNOWN
@@ -135,17 +134,7 @@ class Replay:
         return len(self.transitions)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Store a collector's batch ``(num_envs, T)``; a full storage drops its oldest rows.
-
-        Raises:
-            QPError: ``batch`` is no TensorDict, or has another shape.
-        """
-        remedy = "Pass the collector's batch as it comes."
-        check_kind("batch", batch, TensorDictBase, remedy)
-        if batch.batch_dims != 2 or batch.shape[0] != self.num_envs:
-            want = f"(num_envs, T) with num_envs = {self.num_envs}"
-            remedy = "Transpose it if it is (T, num_envs)." if batch.batch_dims == 2 else remedy
-            raise QPError.expected("batch", f"shape {tuple(batch.shape)}", want, remedy)
+        """Store a collector's batch ``(num_envs, T)``; a full storage drops its oldest rows."""
         if self.active_rows is not None:
             batch = batch.copy()
             for key in ACTIVE_SETS:

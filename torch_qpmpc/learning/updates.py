@@ -16,7 +16,6 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.operators import QPActorValueOperator
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.td_error import td_loss, td_metadata
@@ -85,7 +84,11 @@ def second_order(
     """
     if si is not None:
         check_one_model(mpc)
-    network = _alone(loss_module)
+    network = loss_module.operator
+    if loss_module.value_network is not network or network.theta_keys:
+        remedy = "Learn with first_order and a torch optimiser."
+        got = "a value network with theta_keys or upstream modules"
+        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
     action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
@@ -111,16 +114,6 @@ def second_order(
         return terms, losses
 
     return update
-
-
-def _alone(loss_module: QPQLearningLoss) -> QPActorValueOperator:
-    """Return the value network, if it is the QP's operator with a theta of its own."""
-    network = loss_module.operator
-    if loss_module.value_network is not network or network.theta_keys:
-        remedy = "Learn with first_order and a torch optimiser."
-        got = "a value network with theta_keys or upstream modules"
-        raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
-    return network
 
 
 def entries_of_C(mpc: QPMPC) -> Tensor:

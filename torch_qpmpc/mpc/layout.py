@@ -243,8 +243,11 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int, E: Tensor | None = None) -
             got = f"shape {tuple(matrix.shape)}"
             raise QPError.expected(name, got, f"shape {shape} or {(horizon, *shape)}")
     following = torch.diag_embed(-A.new_ones(horizon, n_x))
-    parts = (*(x.expand(horizon, n_x, -1) for x in (A, B)), following)
-    C = _staircase(torch.cat(parts, dim=-1), n_x + n_u)
+    band = torch.cat((*(x.expand(horizon, n_x, -1) for x in (A, B)), following), dim=-1)
+    # Padded to n more columns than C has and read without these, each row block moves by n.
+    n, n_z = n_x + n_u, horizon * (n_x + n_u) + n_x
+    padded = F.pad(band.movedim(1, 0), (0, n_z + n - band.shape[-1])).flatten(1)
+    C = padded[:, : horizon * n_z].unflatten(-1, (horizon, n_z)).movedim(0, 1).flatten(0, 1)
     preview = F.pad(torch.block_diag(*E.expand(horizon, n_x, n_d)), (0, n_d))
     return torch.cat((preview, C), dim=-1)
 
@@ -253,16 +256,6 @@ def model_of(C: Tensor, layout: Layout) -> tuple[Tensor, ...]:
     """Return A and B and, with a preview, E from the band of C, each with a leading N."""
     E, A, B = layout.stage_blocks(C).split((layout.n_d, layout.n_x, layout.n_u), dim=-1)
     return (A, B, E) if layout.n_d else (A, B)
-
-
-def _staircase(blocks: Tensor, step: int) -> Tensor:
-    """Return rows with ``blocks`` ``(N, i, width)``, each ``step`` columns after the one above."""
-    N, width = len(blocks), blocks.shape[-1]
-    total = (N - 1) * step + width
-    # Padded to total + step columns and read with a stride of total, each block moves by step.
-    padded = F.pad(blocks.movedim(1, 0), (0, total + step - width)).flatten(1)
-    rows = padded[:, : N * total].unflatten(-1, (N, total))
-    return rows.movedim(0, 1).flatten(0, 1)
 
 
 def band_distance(layout: Layout) -> Tensor:

@@ -152,13 +152,19 @@ def read_log(
         7 steps, one step every 1: outputs T [degC]; inputs q
         9 rows: 1 gap, 2 trajectories, 0.0% of rows dropped
     """
+    import pandas as pd
+
     if _is_steps(data):
         if time is not None or episode is not None:
             want = "None for a TensorDict, whose own times and flags are used"
             raise QPError.expected("time, episode", f"{time!r} and {episode!r}", want)
         n_x = None if outputs is None else len(outputs)
         return _named(_of_steps(data, n_x, len(known or ())), outputs, inputs, known)
-    frame, marks = _table(data)
+    frames = [_frame(part) for part in (data if isinstance(data, list | tuple) else [data])]
+    if not frames:
+        raise QPError.expected("data", "an empty list", KINDS)
+    marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
+    frame = pd.concat(frames, ignore_index=True)
     headers = [HEADER.fullmatch(str(header)) for header in frame.columns]
     units = {match[1]: match[2] for match in headers if match}
     frame.columns = [_bare(header) for header in frame.columns]
@@ -250,18 +256,6 @@ def _split(
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun if number == 1 else f'{noun}s'.replace('ys', 'ies')}"
-
-
-def _table(data: Any) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return all rows, and the number of the episode of each."""
-    import pandas as pd
-
-    parts = data if isinstance(data, list | tuple) else [data]
-    frames = [_frame(part) for part in parts]
-    if not frames:
-        raise QPError.expected("data", "an empty list", KINDS)
-    marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
-    return pd.concat(frames, ignore_index=True), marks
 
 
 def _frame(part: Any) -> pd.DataFrame:

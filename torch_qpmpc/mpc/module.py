@@ -181,9 +181,12 @@ class QPMPC(nn.Module):
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
         self._block_ndims = [theta[name].ndim for name in ("H", "H_f") if name in theta]
         for name, start in theta.items():
-            parameters.register(self, name, start.clone(), name in self.learned)
             if name in self.learned:
-                parameters.attach(self, name, self._parametrizations_for(name))
+                parameters.attach(
+                    self, name, start.clone(), self._parametrizations_for(name, start)
+                )
+            else:
+                self.register_buffer(name, start.clone())
 
     @classmethod
     def of(cls, n_x: int, n_u: int, horizon: int, n_d: int = 0, **options: Any) -> Self:
@@ -298,14 +301,14 @@ class QPMPC(nn.Module):
 
         ``qp`` and errors are as in `solve`.
         """
-        return self._value(self._checked(s), qp)
+        return to_dtype(self._solve(self._checked(s), qp).value, s.dtype)
 
     def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return Q(s, a) (eq:qp5), a cost to go, from ``(*batch, n_p)`` and ``(*batch, n_u)``.
 
         ``qp`` and errors are as in `value`.
         """
-        return self._value(self._checked(s, a), qp)
+        return to_dtype(self._solve(self._checked(s, a), qp).value, s.dtype)
 
     def policy(
         self,
@@ -448,7 +451,8 @@ class QPMPC(nn.Module):
         self.structure = structure
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
-                parameters.replace(self, part, self._parametrizations_for(part))
+                value = getattr(self, part).detach()
+                parameters.replace(self, part, self._parametrizations_for(part, value))
 
     @torch.no_grad()
     def project_(self) -> None:
@@ -648,9 +652,6 @@ class QPMPC(nn.Module):
             return check_tensor("s", s, self.n_p, device=self.C_0.device)
         return check_pair(s, a, self.n_p, self.n_u, self.C_0.device)
 
-    def _value(self, fixed: Tensor, qp: QuadraticProgram | None) -> Tensor:
-        return to_dtype(self._solve(fixed, qp).value, fixed.dtype)
-
     def _solve(
         self,
         fixed: Tensor,
@@ -674,24 +675,20 @@ class QPMPC(nn.Module):
     def _action_at_rest(self, x: np.ndarray, warm: bool) -> np.ndarray | None:
         """Return pi of one state, from the last active set or none; None if the QP is not solved.
 
-        From none, it does not depend on earlier calls, so that a resumed run repeats it.
+        From none, it does not depend on earlier calls, so that a resumed run repeats it. The
+        preparation is kept until theta changes; it is None, too, if that cannot be seen.
         """
-        if (at_rest := self._solver_at_rest()) is None:
+        if self._random or self.schedule is not None:
+            return None
+        leaves, at_rest = vars(self).get("_at_rest", (None, None))
+        if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:
+            leaves, at_rest = parameters.Leaves(self), self.at_rest()
+            vars(self)["_at_rest"] = leaves, at_rest
+        if not leaves.known:
             return None
         solution = at_rest.solve(x.reshape(1, -1).astype(np.float64), warm)
         u = solution.z[0, self.n_p : self.n_p + self.n_u]
         return None if solution.status[0] else u.reshape(*x.shape[:-1], -1).astype(x.dtype)
-
-    def _solver_at_rest(self) -> AtRest | None:
-        """Return `at_rest` until theta changes; None if that cannot be seen."""
-        if self._random or self.schedule is not None:
-            return None
-        leaves, solver = vars(self).get("_at_rest", (None, None))
-        if leaves is None or not leaves.unchanged(self) or solver.solver != self.solver:
-            leaves = parameters.Leaves(self)
-            solver = self.at_rest()
-            vars(self)["_at_rest"] = leaves, solver
-        return solver if leaves.known else None
 
     def _scheduled(self, qp: QuadraticProgram, s: Tensor) -> QuadraticProgram:
         """Return ``qp`` with the schedule's changes of C and b at s."""
@@ -722,8 +719,8 @@ class QPMPC(nn.Module):
         w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
         return H, self.discount * theta["q"], w
 
-    def _parametrizations_for(self, name: str) -> list[nn.Module]:
-        value, mask = getattr(self, name).detach(), self._masks.get(name)
+    def _parametrizations_for(self, name: str, value: Tensor) -> list[nn.Module]:
+        mask = self._masks.get(name)
         if self.structure != "free" and name in ("lb", "ub"):
             soft = self.soft.cpu()
             mask = soft if mask is None else mask & soft

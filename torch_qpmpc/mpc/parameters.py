@@ -33,17 +33,9 @@ LARGE = 2**14
 MODELS: dict[type, tuple[str, ...]] = {Banded: ("A", "B", "E"), LinearRows: ("D", "D_f")}
 
 
-def register(module: nn.Module, name: str, value: Tensor, learned: bool) -> None:
-    """Register a part: a parameter if it is learned, else a buffer."""
-    if learned:
-        module.register_parameter(name, nn.Parameter(value))
-    else:
-        module.register_buffer(name, value)
-
-
-def attach(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
-    """Attach parametrizations to a parameter; its value stays."""
-    value = getattr(module, name).detach()
+def attach(module: nn.Module, name: str, value: Tensor, parametrizations: list[nn.Module]) -> None:
+    """Register a learned part with its value and parametrizations."""
+    module.register_parameter(name, nn.Parameter(value))
     for parametrization in parametrizations:
         parametrize.register_parametrization(module, name, parametrization)
     if len(parametrizations) > 1:  # each but the first has changed the value
@@ -52,7 +44,7 @@ def attach(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> N
 
 def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
     """Replace the parametrizations of a part; its value and its ``requires_grad`` stay."""
-    value = getattr(module, name).detach()
+    value = getattr(module, name).detach().clone()
     # torch makes a class per module, which its deep copies share; remove_parametrizations deletes
     # the part's property from it, and would break the copies.
     own = type(type(module).__name__, type(module).__bases__, {**vars(type(module))})
@@ -60,8 +52,7 @@ def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> 
     frozen = not any(leaf.requires_grad for leaf in leaves(module, name))
     parametrize.remove_parametrizations(module, name)
     delattr(module, name)
-    register(module, name, value.clone(), True)
-    attach(module, name, parametrizations)
+    attach(module, name, value, parametrizations)
     for leaf in leaves(module, name):
         leaf.requires_grad_(not frozen)
 

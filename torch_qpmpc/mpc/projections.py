@@ -19,7 +19,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_choice, check_tensor
+from torch_qpmpc.checks import check_choice
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.mpc.validation import without_gradients
 
@@ -111,8 +111,6 @@ def _clarabel() -> ModuleType:
 
 def _replaced(H: Tensor, nearest: Callable[[Tensor], Tensor]) -> Tensor:
     """Return the symmetric part of H, with ``nearest`` where an eigenvalue is negative."""
-    check_tensor("H", H, "n", "n")
-    check_tensor("H", H, "n", H.shape[-2])
     H = (H + H.mT) / 2
     blocks = H.reshape(-1, *H.shape[-2:])
     finite = blocks.isfinite().all(-1).all(-1)

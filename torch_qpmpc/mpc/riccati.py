@@ -8,10 +8,9 @@ import scipy
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.validation import check_weight, without_gradients
+from torch_qpmpc.mpc.validation import without_gradients
 
 if TYPE_CHECKING:
     from torch_qpmpc.mpc.module import QPMPC
@@ -28,17 +27,7 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
         W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
         gamma: discount of the stage costs.
     """
-    check_tensor("A", A, "n_x", "n_x", batched=False)
-    n_x = len(A)
-    check_tensor("A", A, n_x, n_x, batched=False)
-    check_tensor("B", B, n_x, "n_u", batched=False)
-    n = n_x + B.shape[-1]
-    check_tensor(
-        "W", W, n, n, batched=False, remedy="Pass stage_weight(mpc), the weight of [x; u]."
-    )
-    check_number("gamma", gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
-    B, W = B.to(A), W.to(A)
-    check_weight("W", W, diagonal=False, n_d=0)
+    n_x, B, W = len(A), B.to(A), W.to(A)
     P = riccati_weight(A, B, W, gamma)
     left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
     return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])

@@ -102,7 +102,10 @@ class Scheme:
         """
         layout = Layout(n_x, n_u, horizon, n_d, blocks=blocks)
         arguments = {**options, **_started(start)}
-        model, cost, bounds = (_taken(kind, arguments) for kind in (Model, Cost, Bounds))
+        model, cost, bounds = (
+            {x.name: arguments.pop(x.name) for x in fields(kind) if x.name in arguments}
+            for kind in (Model, Cost, Bounds)
+        )
         if arguments:
             check_names(arguments, also=())
         return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
@@ -190,11 +193,6 @@ def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> 
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise TypeError(f"{owner} got an unexpected keyword argument {name!r}{hint}")
-
-
-def _taken(kind: type, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Take the arguments that are fields of a dataclass."""
-    return {x.name: arguments.pop(x.name) for x in fields(kind) if x.name in arguments}
 
 
 def _started(start: Any) -> Mapping[str, Any]:

@@ -79,10 +79,6 @@ class _Observed(NamedTuple):
         W[self.rows, self.columns] = W[self.columns, self.rows] = entries
         return W
 
-    def convex(self, W: Tensor) -> Tensor:
-        """Return the block of W that has to be positive semidefinite."""
-        return W[self.n_free :, self.n_free :]
-
 
 def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = False) -> StageCost:
     """Fit a stage cost whose W is positive semidefinite, except in its first rows and columns.
@@ -92,12 +88,6 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     replaced by the best one that is. The rows and columns of the first ``n_free`` entries of v
     ``(m, n)``, such as d, have any sign; they are zero in a ``diagonal`` W. ``cost`` is ``(m,)``.
     """
-    for name, value in (("v", v), ("cost", cost)):
-        if not len(v) or not value.isfinite().all() or value.abs().amax() > LARGEST:
-            got = f"{value.abs().amax().item():.3g}" if len(v) else "no rows"
-            remedy = "Squares of larger numbers overflow: choose larger units."
-            expected = f"finite numbers up to {LARGEST:g}"
-            raise QPError.expected(name, got, expected, remedy)
     v, cost = v.detach().double(), cost.detach().double()
     n = v.shape[1]
     middle, size = _middle(v), v.std(0, correction=0)
@@ -143,7 +133,7 @@ def _fit(seen: _Observed) -> tuple[Tensor, Tensor, Tensor]:
         if ((seen.cost - X @ exact[0] - exact[1]).abs() <= EXACT * terms).all():
             weights, (w, c) = 1 / terms, exact
     W, q = seen.matrix(w[n:]), w[:n]
-    block = seen.convex(W)
+    block = W[seen.n_free :, seen.n_free :]  # it has to be positive semidefinite
     nearest = _nearest(block)
     if torch.equal(nearest, block):
         return W, q, c
@@ -199,10 +189,15 @@ def _nearest(W: Tensor) -> Tensor:
 def _best_convex(seen: _Observed, block: Tensor) -> Tensor:
     """Return the positive semidefinite block that costs least in place of the best ``block``."""
     rows, columns = seen.rows[~seen.free] - seen.n_free, seen.columns[~seen.free] - seen.n_free
-    kept = seen.convex(seen.matrix((~seen.free).to(block)))
+    kept = seen.matrix((~seen.free).to(block))[seen.n_free :, seen.n_free :]
     F = _profiled(seen)
     F = F / (F @ (_nearest(block) - block)[rows, columns]).norm()
-    T = _whitening(seen) if kept.all() else torch.eye(len(block)).to(block)
+    T = torch.eye(len(block)).to(block)
+    if kept.all():  # such that T'x has uncorrelated entries, with rows weighted as in x's products
+        x = seen.x[:, seen.n_free :]
+        x = x * x.norm(dim=1, keepdim=True)
+        s, V = torch.linalg.eigh(x.mT @ x)
+        T = V / s.clamp(min=1e-12 * s[-1]).sqrt()
     eigenvalues, vectors = torch.linalg.eigh(torch.linalg.solve(T, torch.linalg.solve(T, block).mT))
     # Not at a root of zero, where the gradient is zero.
     start = eigenvalues.clamp(min=FLOOR * eigenvalues.abs().amax()).sqrt()
@@ -225,14 +220,6 @@ def _best_convex(seen: _Observed, block: Tensor) -> Tensor:
     with torch.enable_grad():
         optimizer.step(closure)
     return (T @ root @ root.mT @ T.mT * kept).detach()
-
-
-def _whitening(seen: _Observed) -> Tensor:
-    """Return T such that T'x has uncorrelated entries, with rows weighted as in x's products."""
-    x = seen.x[:, seen.n_free :]
-    x = x * x.norm(dim=1, keepdim=True)
-    s, V = torch.linalg.eigh(x.mT @ x)
-    return V / s.clamp(min=1e-12 * s[-1]).sqrt()
 
 
 def _profiled(seen: _Observed) -> Tensor:
@@ -318,8 +305,8 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
         raise _unfitted("a log without rewards")
     kept = valid_steps(steps)
     reward = ungraded("reward", reward).detach().cpu().reshape(steps.shape)[kept].double()
-    if not reward.isfinite().all():
-        raise _unfitted("a log with rewards of NaN or inf")
+    if not (reward.abs() <= LARGEST).all():
+        raise _unfitted("a log with rewards of NaN or inf, or too large")
     u = steps["action"]
     d = steps["preview"][..., : layout.n_d] if layout.n_d else u[..., :0]
     x, following = (steps[key][..., -layout.n_x :] for key in ("observation", NEXT))

@@ -73,7 +73,9 @@ def check_own(what: str, mpc: Any) -> None:
     """
     for name in getattr(mpc, "parametrizations", ()):
         attached = mpc.get_submodule(f"parametrizations.{name}").children()
-        if [type(x) for x in attached] != [type(x) for x in mpc._parametrizations_for(name)]:
+        if [type(x) for x in attached] != [
+            type(x) for x in mpc._parametrizations_for(name, getattr(mpc, name).detach())
+        ]:
             got = f"a parametrization of {name} that is not QPMPC's own"
             remedy = "Save the state_dict, or remove_parametrizations first."
             raise QPError.expected(what, got, "QPMPC's own", remedy)

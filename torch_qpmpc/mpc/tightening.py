@@ -68,24 +68,16 @@ def tighten(
         raise QPError.expected("mpc", got, "fixed bounds", "Leave lb and ub out of learn.")
     K = covariances.new_zeros(n_u, n_x) if K is None else K
     check_tensor("K", K, n_u, n_x, batched=False)
-    variance = _row_variance(mpc, covariances.to(mpc.lb), K.to(mpc.lb))
+    errors, S = torch.cat((torch.eye(n_x).to(K), K)).to(mpc.lb), mpc.lb.new_zeros(mpc.n_z, mpc.n_z)
+    for k, covariance in enumerate(covariances.to(mpc.lb)):
+        first = mpc.n_p + (k - 1) * n_x + k * n_u  # of x_k in z
+        stage = slice(first, min(first + n_x + n_u, mpc.n_z))
+        part = errors[: stage.stop - first]  # without an action for x_N
+        S[stage, stage] = part @ covariance @ part.mT
+    variance = ((mpc.G @ S) * mpc.G).sum(-1).clamp(min=0)  # of each row's g'z
     margin = float(ndtri(probability)) * variance.sqrt()
     lb, ub = mpc.lb + margin, mpc.ub - margin
     halfway = (mpc.lb + mpc.ub) / 2
     crossed = lb > ub
     mpc.lb.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, lb), mpc.lb))
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
-
-
-def _row_variance(mpc: QPMPC, covariances: Tensor, K: Tensor) -> Tensor:
-    """Return the variance of each row's g'z, ``(n_g,)``."""
-    n_x, n = mpc.n_x, mpc.n_x + mpc.n_u
-    errors = torch.cat((torch.eye(n_x).to(K), K))
-    # The first entry of x_0 in z; what comes before is known.
-    first = mpc.n_p - n_x
-    S = K.new_zeros(mpc.n_z, mpc.n_z)
-    for k, covariance in enumerate(covariances):
-        stage = slice(first + k * n, min(first + (k + 1) * n, mpc.n_z))
-        size = stage.stop - stage.start  # without an action for x_N
-        S[stage, stage] = errors[:size] @ covariance @ errors[:size].mT
-    return ((mpc.G @ S) * mpc.G).sum(-1).clamp(min=0)

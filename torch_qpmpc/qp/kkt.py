@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
@@ -36,15 +36,6 @@ PARALLEL = 1e-6
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
 
 
-class KKTSolution(NamedTuple):
-    """p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)`` and u ``(*batch, n_f)``."""
-
-    p: Tensor
-    r: Tensor
-    t: Tensor
-    u: Tensor
-
-
 def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Call `solve_kkt` in the form that the current trace supports; its derivative raises."""
     if torch.compiler.is_compiling():
@@ -54,8 +45,10 @@ def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return Opaque.apply(*arguments)
 
 
-def solve_kkt(*arguments: Any) -> KKTSolution:
-    """Solve the KKT system for p, r, t and u, in condensed form for the whole batch at once.
+def solve_kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Solve the KKT system in condensed form for the whole batch at once.
+
+    Returns p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)`` and u ``(*batch, n_f)``.
 
     The ``arguments`` are the gradients in z, lam, chi and xi; z, lam, status; H, .., fixed; and
     n_kept of `Programs.of`. The gradients of unsolved elements are zero.
@@ -81,10 +74,13 @@ def solve_kkt(*arguments: Any) -> KKTSolution:
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in like)
     for x, solution in zip(results, solutions, strict=False):
         x[which] = solution.to(x)
-    return KKTSolution._make(x.reshape(*batch, x.shape[-1]) for x in results)
+    p, r, t, u = (x.reshape(*batch, x.shape[-1]) for x in results)
+    return p, r, t, u
 
 
-def _solve_kkt(programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam) -> KKTSolution:
+def _solve_kkt(
+    programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam
+) -> tuple[Tensor, ...]:
     n_f, theta = programs.n_f, programs.prepared.theta
     tensor = partial(torch.as_tensor, device=z.device)
     group = tensor(programs.group)
@@ -104,7 +100,7 @@ def _solve_kkt(programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam) 
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
     r = -multiply(Y_neg.mT, group, left)
     u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
-    return KKTSolution(p_z, r, t, u)
+    return p_z, r, t, u
 
 
 def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:

@@ -239,43 +239,39 @@ def _try_active_sets(qps, sensitivities, active) -> tuple[Tensor, ...]:
     active = torch.where(known.unsqueeze(-1), active, 0)
     v, lam, y = _solve(qps, sensitivities, active)
     steps, done = torch.ones_like(qps.group), torch.ones_like(known)
-    todo = _contradicted(qps, active, lam, y).nonzero().squeeze(-1)
+    corrected, contradicted = _correct(qps, active, lam, y)
+    at = todo = contradicted.nonzero().squeeze(-1)
     for _ in range(MAX_STEPS - 1):
         if not len(todo):
             break
-        rest = qps.take(todo)
-        active[todo] = _corrected(rest, active[todo], lam[todo], y[todo])
-        v[todo], lam[todo], y[todo] = new = _solve(rest, sensitivities, active[todo])
+        rest, active = qps.take(todo), corrected[at]
+        v[todo], lam[todo], y[todo] = new = _solve(rest, sensitivities, active)
         steps[todo] += 1
-        todo = todo[_contradicted(rest, active[todo], *new[1:])]
+        corrected, contradicted = _correct(rest, active, *new[1:])
+        at = contradicted.nonzero().squeeze(-1)
+        todo = todo[at]
     done[todo] = False
     return v, lam, steps, done
 
 
-def _contradicted(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
-    """Return the mask of QPs whose lam or y contradicts the active set, ``(B,)``.
+def _correct(qps, active: Tensor, lam: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the semi-smooth Newton method's next active sets, and the mask of QPs that need them.
 
-    A saturated row that is back within its bounds is left to the certificate.
+    A saturated row that is back within its bounds is held, but is no reason for another step: it is
+    left to the certificate.
     """
-    outside = (y - y.clamp(qps.l, qps.u)).abs_() > SLIP * (1 + y.abs())
-    outside &= active.abs() < 2
-    inwards = lam * active < -SLIP * (1 + lam.abs())
-    return (outside | inwards | (lam.abs() > (1 + SLIP) * qps.w)).any(-1)
-
-
-def _corrected(qps, active: Tensor, lam: Tensor, y: Tensor) -> Tensor:
-    """Return the semi-smooth Newton method's next active set."""
-    slip = SLIP * (1 + y.abs())
+    slip, size = SLIP * (1 + y.abs()), active.abs()
     above, below = y > qps.u + slip, y < qps.l - slip
-    held = active.abs() == 1
-    over = held & (lam.abs() > (1 + SLIP) * qps.w)
+    over = lam.abs() > (1 + SLIP) * qps.w
+    inwards = lam * active < -SLIP * (1 + lam.abs())
+    contradicted = (over | inwards | ((above | below) & (size < 2))).any(-1)
     # A held row whose multiplier points inwards is released, unless its bounds are equal.
-    loose = held & (lam * active < -SLIP * (1 + lam.abs())) & (qps.l < qps.u)
-    # A saturated row that is back within its bounds is held, like an inactive one outside them.
+    loose = (size == 1) & inwards & ~over & (qps.l < qps.u)
     back = ((active == 2) & (y < qps.u - slip)) | ((active == -2) & (y > qps.l + slip))
-    corrected = torch.where(over, 2 * lam.sign().to(torch.int8), active)
-    corrected = torch.where(back, active.sign(), corrected).masked_fill_(loose & ~over, 0)
-    return torch.where(active == 0, above.to(torch.int8) - below.to(torch.int8), corrected)
+    corrected = torch.where((size == 1) & over, 2 * lam.sign().to(torch.int8), active)
+    corrected = torch.where(back, active.sign(), corrected).masked_fill_(loose, 0)
+    inactive = above.to(torch.int8) - below.to(torch.int8)
+    return torch.where(active == 0, inactive, corrected), contradicted
 
 
 def _solve(qps, sensitivities, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -84,9 +84,17 @@ class Prepared:
         return Theta._make(on_device(x, self.device) for x in self.theta)
 
     @cached_property
+    @np.errstate(all="ignore")
     def valid(self) -> np.ndarray | None:
         """Mask of finite data, lb <= ub and w >= 0, ``(B or 1,)``; None if all are valid."""
-        return _valid(self.theta, self.group)
+        H, C, G, q, c, b, lb, ub, w = self.theta
+        # A sum is finite if its terms are, but for overflow, which no solver survives either.
+        finite = np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G)))
+        finite = finite if len(H) == 1 else finite[self.group]
+        # The widths of bounds are NaN if both are the same infinity.
+        valid = np.isfinite(q.sum(-1) + b.sum(-1) + c) & finite
+        valid = valid & (ub - lb >= 0).all(-1) & (w >= 0).all(-1)
+        return None if valid.all() else valid
 
     @cached_property
     def units(self) -> Units | None:
@@ -181,18 +189,6 @@ class Prepared:
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
-
-
-@np.errstate(all="ignore")
-def _valid(theta: Theta, group: np.ndarray) -> np.ndarray | None:
-    """Return `Prepared.valid`."""
-    H, C, G, q, c, b, lb, ub, w = theta
-    # A sum is finite if its terms are, but for overflow, which no solver survives either.
-    finite = np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G)))
-    valid = np.isfinite(q.sum(-1) + b.sum(-1) + c) & (finite if len(H) == 1 else finite[group])
-    # False for NaN, such as inf - inf of two bounds of the same infinity.
-    valid = valid & (ub - lb >= 0).all(-1) & (w >= 0).all(-1)
-    return None if valid.all() else valid
 
 
 #: The latest thetas that are kept: V and Q of an online and a target network.

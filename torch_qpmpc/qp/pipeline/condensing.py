@@ -170,7 +170,10 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     enters = (np.abs(G) > ENTERS * terms).any(0)
     sums = row_sums(theta.H), row_sums(theta.G), row_sums(theta.C)
     arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
-    convex = padding is None and _has_factor(H)
+    # Cholesky factors prove it; eigenvalues take many times as long.
+    shift = CONVEX * (1 + H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0))
+    shifted = torch.from_numpy(H + shift[:, None, None] * np.eye(H.shape[1]))
+    convex = padding is None and not torch.linalg.cholesky_ex(shifted).info.any()
     return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
 
 
@@ -179,17 +182,6 @@ def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     if np.count_nonzero(left) > SPARSE * left.size:
         return left @ right
     return kernels.sparse_products(left, np.ascontiguousarray(right))
-
-
-def _has_factor(H: np.ndarray) -> bool:
-    """Return True if Cholesky factors prove all H convex; eigenvalues take many times as long."""
-    largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
-    shift = CONVEX * (1 + largest[:, None, None]) * np.eye(H.shape[1])
-    try:
-        np.linalg.cholesky(H + shift)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 @np.errstate(all="ignore")

@@ -21,11 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.solvers import daqp
 
 #: A sum counts as zero, or as significant, relative to the sum of its absolute terms.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7
@@ -114,9 +113,8 @@ def _status(qp: _FreeQP, C_range: _Range) -> Status:
 def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.ndarray, np.ndarray]:
     """Return the feasible point nearest to z, where C z = b, and multipliers against feasibility.
 
-    DAQP is faster, and tried first. If it fails, Lawson and Hanson's least distance programming
-    decides: for rows ``A v >= h``, the residual of ``min |[A'; h'] lam - e|`` over ``lam >= 0``
-    gives the point, or is zero if there is none.
+    This is Lawson and Hanson's least distance programming: for rows ``A v >= h``, the residual of
+    ``min |[A'; h'] lam - e|`` over ``lam >= 0`` gives the point, or is zero if there is none.
     """
     hard, y = np.isinf(qp.w), qp.G @ z
     no_multipliers = np.zeros(len(hard))
@@ -128,9 +126,6 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
     A = _product(qp.G[hard], C_range.null) / norms[:, None]
     lower, upper = lower / norms, upper / norms
     length = max(lower.max(), -upper.min())
-    nearest = z + C_range.null @ _least_distance(A, lower / length, upper / length) * length
-    if _is_feasible(qp, nearest):
-        return nearest, no_multipliers
     below, above = np.isfinite(lower), np.isfinite(upper)
     h = np.concatenate((lower[below], -upper[above])) / length
     E = np.concatenate((np.concatenate((A[below], -A[above])).T, h[None]))
@@ -150,14 +145,6 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
     lam = no_multipliers
     lam[hard] = multipliers / norms
     return z, lam
-
-
-def _least_distance(A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the shortest v with ``lower <= A v <= upper``, if DAQP finds it."""
-    unit, zero = np.eye(A.shape[1]), np.zeros((1, A.shape[1]))
-    w = np.full((1, len(A)), np.inf)
-    rows = (A[None], np.zeros(1, np.int64), zero, lower[None], upper[None], w)
-    return daqp.solve(SoftQPs(unit[None], *rows)).v[0]
 
 
 def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, C_range: _Range) -> bool:

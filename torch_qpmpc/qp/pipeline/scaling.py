@@ -57,8 +57,11 @@ class Units(NamedTuple):
     @np.errstate(all="ignore")
     def of_columns(cls, theta: Theta) -> Units | None:
         """Return units of the entries of z that follow from the matrices; None if alike."""
-        if (columns := _columns(theta)) is None:
+        of_C, of_G = (column_sizes(x) for x in (theta.C, theta.G))
+        curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
+        if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
             return None
+        columns = lengths(theta.H, np.concatenate((theta.C, theta.G), axis=1))
         one = np.ones((len(columns), 1))
         n_c, n_g = theta.C.shape[1], theta.G.shape[1]
         return cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1))
@@ -122,15 +125,6 @@ class Units(NamedTuple):
             lam=solution.lam * (cost / rows),
             xi=solution.xi * (cost / length[:, : solution.xi.shape[-1]]),
         )
-
-
-def _columns(theta: Theta) -> np.ndarray | None:
-    """Return the `lengths` of the entries of z; None if the columns are alike."""
-    of_C, of_G = (column_sizes(x) for x in (theta.C, theta.G))
-    curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
-    if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
-        return None
-    return lengths(theta.H, np.concatenate((theta.C, theta.G), axis=1))
 
 
 def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:

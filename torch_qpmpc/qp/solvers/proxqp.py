@@ -32,7 +32,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
     batch = proxqp.sparse.BatchQP(n_qps)
     handles = []
     for m, g, lower, upper, w in zip(*qps[2:], strict=True):
-        qp = batch.init_qp_in_place(form.n_x, 0, form.n_in)
+        qp = batch.init_qp_in_place(form.n_v + form.n_t, 0, form.n_rows + form.n_t)
         _configure(qp.settings, form.paired)
         gradient, bounds = form.gradient(g, w), form.bounds(lower, upper, w)
         # No preconditioner: it takes a third of the time of the solve and saves no iteration.

@@ -55,16 +55,6 @@ class SplitSlack:
         )
 
     @property
-    def n_x(self) -> int:
-        """Number of variables: v and the slacks."""
-        return self.n_v + self.n_t
-
-    @property
-    def n_in(self) -> int:
-        """Number of rows: those of G and the slacks' signs."""
-        return self.n_rows + self.n_t
-
-    @property
     def paired(self) -> bool:
         """True if each soft row has two slacks."""
         return np.array_equal(self.over, self.under)
