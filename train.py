@@ -51,7 +51,7 @@ from torch_qpmpc.experiment.metrics import (
     update_metrics,
 )
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, export_run, save_checkpoint
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, save_checkpoint
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -188,8 +188,6 @@ def _train(
         evaluation.evaluate(learner.policy, "candidate")
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
-        if cfg.export is not None:
-            export_run(gate.mpc, run.path, quiet)
         run.finish(summary)
     if not quiet:
         print(f"\n{table(summary)}\n\n{run.path}")

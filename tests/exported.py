@@ -14,7 +14,6 @@ import torch
 
 from tests.benchmarks.problems import PAPER, Size, make_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram
-from torch_qpmpc.export.comparison import Reference, reference, sharpen
 from torch_qpmpc.export.export import AT_LEAST, PER_ROW
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import Tables, make_tables
@@ -155,13 +154,6 @@ def load(
     for name, text in sources(tables, chosen, "", nothing).items():
         (folder / name).write_text(text, encoding="utf-8")
     return Library(folder, "policy", chosen.dtype, (*flags, "-std=c99", "-fPIC", "-shared")), tables
-
-
-def exact(mpc: Any, p: np.ndarray, u: np.ndarray) -> Reference:
-    """Return a solver's solutions, exact ones where its actions differ from u."""
-    coarse = reference(mpc, p)
-    off = np.abs(coarse.u - u).max(-1) > 1e-10 * (1 + np.abs(u).max(-1))
-    return sharpen(mpc, p, coarse, np.flatnonzero(off))
 
 
 def compilers() -> dict[str, list[str]]:

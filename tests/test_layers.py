@@ -27,7 +27,6 @@ LAYERS = {
         "qp",
         "mpc",
         "export",
-        "proofs",
         "learning",
         "analysis",
     },
@@ -55,12 +54,6 @@ LAYERS = {
     },
     "report": {"study"},  # `python -m torch_qpmpc.report`
     "train": {"files"},  # `python -m torch_qpmpc.train`
-    "export/__main__": {
-        "errors",
-        "export",
-        "experiment",
-        "study",
-    },  # `python -m torch_qpmpc.export`
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {

@@ -22,7 +22,7 @@ from torch import Tensor, eye, ones, tensor, zeros
 import torch_qpmpc as qm
 from tests.problems import known_qp, random_mpc
 from tests.transitions import make_batch, make_loss, make_operator
-from torch_qpmpc.analysis.policy import local_gain, policy_map, spectral_radius
+from torch_qpmpc.analysis.policy import local_gain, spectral_radius
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (
     canonical_matrix,
@@ -201,12 +201,10 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("true_model: got tuple of 1, expected the pair (A, B), (A, B,", lambda: read(mpc, (A2,))),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: structure_metrics(op)),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: local_gain(op, S)),
-    ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: policy_map(op, ones(2), ones(2))),
     ("s: got shape (3,), expected shape (*batch, 2).", lambda: local_gain(mpc, zeros(3))),
     ("terminal_weight: got a Riccati equation without a", lambda: lqr_gain(A2 * nan, B1, I3)),
     ("K: got shape (2, 1), expected shape", lambda: spectral_radius(A2, B1, zeros(2, 1).double())),
     ("A, B, K: got NaN or inf", lambda: spectral_radius(A2 * nan, B1, zeros(1, 2).double())),
-    ("x: got NaN or inf, expected finite entries.", lambda: policy_map(mpc, [nan], [0.0])),
     ("model: got tuple, expected a NearestModel. Pass", lambda: one_step_error((A2, B1), A2, B1)),
     ("offset: got shape (3,), expected", lambda: one_step_error(model, A2, B1, zeros(3).double())),
     ("moment: got shape (3, 3), expected", lambda: one_step_error(model, A2, B1, moment=eye(3))),

@@ -192,7 +192,6 @@ register(
         closed_loop=plant_loop,
         rivals={"thermostat with timer": thermostat, "omniscient": Omniscient},
         episode=episode,
-        unit=(DAY, "days"),
         settings=Settings,
         defaults={**OPTIONS, "task": TASK},
     )

@@ -16,9 +16,7 @@ from torch_qpmpc.analysis.plots import (
     canonical_figure,
     episode_figure,
     plans_along,
-    policy_figure,
 )
-from torch_qpmpc.analysis.policy import policy_map
 from torch_qpmpc.analysis.structure import nearest_model, predictions
 
 pytestmark = pytest.mark.layout
@@ -45,18 +43,6 @@ def test_a_C_without_canonical_form_is_an_error():
         mpc.C.zero_()
     with pytest.raises(QPError, match="of rank 0 of 16"):
         canonical_figure(mpc)
-
-
-def test_the_policy_figure_has_four_panels():
-    grid = torch.linspace(-1, 1, 9)
-    found = policy_map(make_mpc(), grid, grid[:7], axes=(0, 2))
-    figure = policy_figure(found, action=1)
-    for axes in figure.axes[:4]:
-        (mesh,) = axes.collections
-        assert np.isfinite(np.asarray(mesh.get_array())).all()
-        assert (axes.get_xlabel(), axes.get_ylabel()) == ("$s_{1}$", "$s_{3}$")
-    assert f"{len(found.active_sets)} regions" in figure.axes[3].get_title()
-    rendered(figure)
 
 
 def test_an_episode_has_a_panel_for_each_signal():

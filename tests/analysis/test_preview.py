@@ -13,11 +13,8 @@ from torch.testing import assert_close
 from tests.figures import image_of, rendered
 from tests.problems import model_form, normal, predict
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError
-from torch_qpmpc.analysis.plots import (
-    canonical_figure,
-    policy_figure,
-)
-from torch_qpmpc.analysis.policy import local_gain, policy_map
+from torch_qpmpc.analysis.plots import canonical_figure
+from torch_qpmpc.analysis.policy import local_gain
 from torch_qpmpc.analysis.report import read, structure_metrics
 from torch_qpmpc.analysis.structure import (
     PredictionForm,
@@ -197,18 +194,6 @@ def test_figures_are_drawn_and_labelled():
             assert {"$d_{0}$", "$x_{0}$"} <= labels
             assert np.isfinite(image_of(axes)).all()
     rendered(figure)
-
-
-def test_a_map_is_one_of_x_0():
-    mpc, grid, first = scheme(), torch.linspace(-1, 1, 3), LAYOUT.n_preview
-    found = policy_map(mpc, grid, grid)
-    assert (found.axes, found.names) == ((first, first + 1), ("x_{0,1}", "x_{0,2}"))
-    assert (found.states[..., :first] == 0).all()
-    assert_close(found.actions[1, 2], mpc.policy(found.states[1, 2]).detach())
-    assert policy_figure(found).axes[0].get_xlabel() == "$x_{0,1}$"
-    assert policy_map(mpc, grid, grid, axes=(1, LAYOUT.n_preview)).names == ("d_{0,2}", "x_{0,1}")
-    with pytest.raises(QPError, match=r"axes: got \(4, 5\), expected two different states"):
-        policy_map(QPMPC.of(1, 1, 3, n_d=1), grid, grid)
 
 
 @pytest.mark.parametrize(

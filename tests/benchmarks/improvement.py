@@ -100,8 +100,7 @@ def trained(case: Case, seed: int) -> tuple[DictConfig, int, dict[str, Any]]:
 def run(case: str, seed: int) -> dict[str, Any]:
     """Return the fields of a row."""
     cfg, logged, summary = trained(CASES[case], seed)
-    before, each, _ = experience(cfg)
-    unit, _ = find_task(cfg.task).unit
+    before, each = experience(cfg)
     costs = {
         "start": summary["J_start"],
         IDENTIFICATION: summary["rivals"][IDENTIFICATION],
@@ -109,7 +108,7 @@ def run(case: str, seed: int) -> dict[str, Any]:
         "true model": summary["J_true_model"],
         **fixed_costs(case),
     }
-    transitions = round((before + each * cfg.updates) * unit) + logged
+    transitions = before + each * cfg.updates + logged
     names = {"case": case, "seed": seed}
     return names | {name: costs[name] for name in COSTS} | {"transitions": transitions}
 

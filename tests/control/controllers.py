@@ -52,7 +52,6 @@ def load(
 ) -> CompiledController:
     """Compile the files of an export."""
     texts = {x.name: x.read_text() for x in files if x.suffix in (".c", ".h")}
-    del texts["main.c"]
     return CompiledController(texts, name, dtype, len(controller.u))
 
 

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
-from torch_qpmpc.control import review, simulation
+from torch_qpmpc.control import review
 from torch_qpmpc.control.linear_loop import LinearLoop
-from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.export.tables import make_tables
-from torch_qpmpc.proofs import Answer, Plant, Polytope, largest_violation
 
 LAG = ([[0.9]], [[0.5]])
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
@@ -27,13 +23,13 @@ DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
 TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
 #: Steps of the loop that probes the weights and the QP.
-PROBED = simulation.PROBED
+PROBED = review.PROBED
 
 
 @pytest.fixture(autouse=True)
 def quick_probe(monkeypatch: pytest.MonkeyPatch) -> None:
     """Probe by one set-point, except in the tests of what the probe tells."""
-    monkeypatch.setattr(simulation, "PROBED", simulation.HELD)
+    monkeypatch.setattr(review, "PROBED", review.HELD)
 
 
 def controller(model, horizon=10, filtered=None, r=None, **options):
@@ -136,7 +132,7 @@ MISTAKES = {
 def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake, monkeypatch):
     (model, options), (name, remedy), change = MISTAKES[mistake]
     if name == "weights":
-        monkeypatch.setattr(simulation, "PROBED", PROBED)
+        monkeypatch.setattr(review, "PROBED", PROBED)
     design = {"model": model, **options}
     fault = made(**design)[name]
     assert not fault.ok
@@ -190,7 +186,7 @@ def loop(model, **options):
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
 def test_a_sound_design_has_no_fault(model, monkeypatch):
-    monkeypatch.setattr(simulation, "PROBED", PROBED)
+    monkeypatch.setattr(review, "PROBED", PROBED)
     found = made(model, 15, r=[0.5])
     assert found.faults == []
     assert len(found.findings) == 13
@@ -289,54 +285,6 @@ def test_a_learned_cost_that_is_indefinite_is_named():
         found["stability"]
 
 
-def test_the_page_has_all_findings_and_the_figure(tmp_path):
-    figure = Figure()
-    review = made(LAG, r=[7.0])
-    assert "FAULT set-points: y1 reaches [-5, 5]" in str(review)
-    review.to_html(tmp_path / "review.html", figure)
-    page = (tmp_path / "review.html").read_text()
-    assert page.count("<tr>") == 1 + len(review.findings)
-    assert "<td>Set y1 to 4, not 7, or widen y_bounds of y1.</td>" in page
-    (data,) = re.findall(r"data:image/png;base64,([^\"]*)", page)
-    assert base64.b64decode(data).startswith(b"\x89PNG")
-    Review([Finding("<b>", True, {"a & b": 1.0})]).to_html(tmp_path / "names.html")
-    names = (tmp_path / "names.html").read_text()
-    assert "<td>&lt;b&gt;</td><td>ok</td><td>a &amp; b 1</td>" in names
-
-
-def y1_within(mpc: qm.LinearMPC, bound: float) -> Answer:
-    """Ask whether y1 - r stays below a bound from at most 1, with a noise of 0.1."""
-    model = mpc.scheme.model  # of p = [y1 - r, u_last - u_s, u_s, 1]
-    noise, E = Polytope.box([-0.1], [0.1]), np.eye(mpc.n_p)[:, :1]
-    plant = Plant.of(model.A.numpy(), model.B.numpy(), E=E, disturbances=noise)
-    starts = Polytope.box([-1.0, -0.2, 0.0, 1.0], [1.0, 0.2, 0.0, 1.0])
-    upper = np.where(np.arange(mpc.n_p) == 0, bound, np.inf)
-    return largest_violation(mpc, plant, starts, upper=upper)
-
-
-def test_proofs_are_findings_of_the_review_and_its_page(tmp_path):
-    controller = qm.Controller(qm.LinearMPC(LAG, 3, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0)))
-    proved, refuted = (y1_within(controller.mpc, bound) for bound in (0.9, 0.2))
-    undecided = replace(proved, bound=0.5)
-    proofs = {"y1 < 0.9": proved, "y1 < 0.2": refuted, "y1 < 0.9 in no time": undecided}
-    review = controller.review(proofs=proofs)
-    assert [x.name for x in review.faults] == ["y1 < 0.2", "y1 < 0.9 in no time"]
-    first, second, third = (review[name] for name in proofs)
-    assert first.text.startswith(f"largest violation in 1 step {proved.value:.4g}; proved bound -0")
-    # The violation grows with y and d alone: any last input is a worst case.
-    assert re.search(r"; from p \[1, \S+, 0, 1\]; d_0 \[0\.1\]$", second.text)
-    assert second.remedy.startswith("Claim it of a smaller set, or of smaller disturbances")
-    assert third.remedy == "It is undecided: give it more seconds."
-    assert "\nok    y1 < 0.9: largest violation" in str(review)
-    review.to_html(tmp_path / "review.html")
-    assert "<td>y1 &lt; 0.2</td><td>fault</td>" in (tmp_path / "review.html").read_text()
-    another = qm.Controller(qm.LinearMPC(LAG, 3, Q=1.0, dR=0.2, u_bounds=(-1.0, 1.0)))
-    with pytest.raises(QPError, match=r"^the proof of 'y1 < 0.9': got another QP's"):
-        another.review(proofs={"y1 < 0.9": proved})
-    with pytest.raises(QPError, match=r"^proofs: got str, expected an Answer.*Pass what a quest"):
-        another.review(proofs={"y1 < 0.9": "proved"})  # pyright: ignore[reportArgumentType]
-
-
 # The linear loop
 
 
@@ -397,7 +345,7 @@ def test_shares_are_the_gradient_of_the_loop_s_cost():
 
 
 def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
-    monkeypatch.setattr(simulation, "PROBED", PROBED)
+    monkeypatch.setattr(review, "PROBED", PROBED)
     Q = [[1.0, -0.9], [-0.9, 1.0]]
     mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=Q, R=0.1, u_bounds=(-3.0, 3.0), y_bounds=(-1.0, 1.0))
     weights = qm.Controller(mpc).review()["weights"]
@@ -405,23 +353,7 @@ def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
     assert weights.ok
 
 
-def test_tight_bounds_take_more_iterations(monkeypatch):
-    monkeypatch.setattr(simulation, "PROBED", PROBED)
-    mpc = qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1, u_bounds=(-0.2, 0.2))
-    controller = qm.Controller(mpc)
-    numbers = controller.review()["C code"].numbers
-    worst = "and in its worst step"
-    assert 1 < numbers["least iterations of a step in the loop, on average"] < numbers[worst] <= 21
-    free = qm.Controller(qm.LinearMPC(INTEGRATOR, 10, Q=1.0, dR=0.1)).review()["C code"].numbers
-    assert free[worst] == 1
-
-
-def test_the_c_code_is_as_large_as_its_export_and_refused_as_by_it(tmp_path):
-    mpc = qm.LinearMPC(TWO_OUTPUTS, 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0), references="preview")
-    controller = qm.Controller(mpc)
-    numbers, export = controller.review()["C code"].numbers, controller.export_c(tmp_path)
-    sizes = (numbers["bytes of tables"], numbers["bytes of the state"])
-    assert sizes == (export.table_bytes, export.state_bytes)
+def test_outputs_whose_bounds_the_export_refuses_are_a_fault(tmp_path):
     model = (np.diag([0.9, 0.5]), np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
     design = {"R": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": {"y2": (-1.0, 1.0)}}
     refused = qm.Controller(qm.LinearMPC(model, 5, Q=[1.0, 0.0], **design))

@@ -282,9 +282,9 @@ def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path):
 
 
 @pytest.mark.usefixtures("turning")
-@pytest.mark.parametrize(("needs", "there"), [((), True), (("export=c",), False)])
-def test_blended_models_are_no_start_of_a_run_that_needs_one_C(needs, there):
-    cfg = make_config(*DATA, *needs)
+@pytest.mark.parametrize(("si", "there"), [("null", True), ("{beta: 1.0, windows: 2}", False)])
+def test_blended_models_are_no_start_of_a_run_that_needs_one_C(si, there):
+    cfg = make_config(*DATA, f"constraint.si={si}")
     physics: Any = make_physics(cfg)
     named = candidates(cfg, physics, collect_log(cfg, physics))
     assert any("blended" in name for name in named) == there

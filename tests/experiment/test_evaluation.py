@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
-import gymnasium
 import pytest
 import torch
-from gymnasium.envs.classic_control import PendulumEnv
-from gymnasium.envs.registration import EnvSpec
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc.envs import GymnasiumPlant, Plant
 from torch_qpmpc.envs.closed_loop import gymnasium_loop, plant_loop
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.evaluation import UNPAIRED, Evaluation
+from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, Policy, zero_action
 from torch_qpmpc.experiment.tasks import TASKS, make_mpc, make_physics, register
 
@@ -72,21 +69,6 @@ def test_zero_action_is_the_action_within_the_bounds_nearest_to_zero():
     assert rivals_of(cfg, plant) == {ZERO_ACTION: loop.J}
     plant.lb_a = plant.lb_a + 3.0
     assert zero_action(plant)(torch.zeros(2, 3)).tolist() == [[1.0], [1.0]]
-
-
-@pytest.mark.parametrize("seeded", [True, False])
-def test_episodes_that_their_seeds_do_not_determine_are_said(monkeypatch, recwarn, seeded):
-    class Unseeded(PendulumEnv):
-        def reset(self, *, seed=None, options=None):
-            return super().reset(seed=seed if seeded else None, options=options)
-
-    monkeypatch.setitem(gymnasium.registry, "Un-v0", EnvSpec("Un-v0", lambda **_: Unseeded()))
-    W, settings = [0.0, 2.0, 0.2, 0.1], (*SMALL, "task=pendulum", "task.id=Un-v0")
-    cfg = make_config(*settings, f"task.stage_weight={torch.diag(torch.tensor(W)).tolist()}")
-    plant = make_physics(cfg)
-    Evaluation.before(cfg, plant, make_mpc(cfg, plant))
-    said = [str(x.message) for x in recwarn if "with one seed and the same" in str(x.message)]
-    assert said == ([] if seeded else [UNPAIRED.format(id="Un-v0")])
 
 
 def test_rivals_have_the_disturbances_of_the_learned_policy(rivals):

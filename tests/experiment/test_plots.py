@@ -62,7 +62,7 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
 
 
 def test_experience_counts_the_log_and_the_warm_up():
-    assert experience(make_config()) == (192, 64, "transitions of experience")
+    assert experience(make_config()) == (192, 64)
     log = ("start=data", "start.transitions=192")
     assert experience(make_config(*log))[0] == 192 + 192
     assert experience(make_config(*log, "start.file=log.pt"))[0] == 192

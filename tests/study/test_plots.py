@@ -31,7 +31,7 @@ def test_J_is_drawn_over_experience_with_the_others_as_lines(gaussian, axes):
     assert updates.tolist() == [0, 2, 4]
     np.testing.assert_allclose(lines["free"].get_ydata(), interquartile_mean(J))
     assert set(lines) == {"fixed", "free", "start", "true model", "omniscient"}
-    assert axes.get_xlabel() == "transitions of experience"
+    assert axes.get_xlabel() == "transitions"
     cfg = gaussian["run"].iloc[0].cfg
     assert {*np.diff(lines["free"].get_xdata())} == {2 * cfg.num_envs * cfg.steps_per_update}
 

@@ -1,4 +1,4 @@
-"""Figures of a learned QP: its canonical form, its policy's regions, and an episode with plans."""
+"""Figures of a learned QP: its canonical form, and an episode with plans."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Any
 
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_qpmpc.analysis.policy import PolicyMap
 from torch_qpmpc.analysis.structure import (
     PredictionForm,
     canonical,
@@ -118,40 +116,6 @@ def canonical_figure(mpc: QPMPC) -> Figure:
     defect, distance = causality_defect(learned).item(), nearest_model(learned).residual.item()
     numbers = f"causality defect {defect:.2g}, distance to MPC {distance:.2g}"
     _draw_prediction_form(after, learned, rf"$[\Phi, \Gamma]$, learned: {numbers}")
-    return figure
-
-
-def _draw_slice(axes: Axes, mapped: PolicyMap, field: Tensor, title: str, **style: Any) -> QuadMesh:
-    """Draw a field on the grid, ``(n, m)``, blank where it is nan."""
-    grid = (part.numpy() for part in (mapped.x, mapped.y, field.mT))
-    image = axes.pcolormesh(*grid, shading="nearest", rasterized=True, **style)
-    first, second = mapped.names
-    axes.set(xlabel=f"${first}$", ylabel=f"${second}$", title=title)
-    return image
-
-
-def _draw_regions(axes: Axes, mapped: PolicyMap) -> None:
-    """Draw the regions of one active set each; colours repeat."""
-    title = f"Active sets: {len(mapped.active_sets)} regions on this grid"
-    colours = (mapped.regions % 20).double().masked_fill(mapped.regions < 0, torch.nan)
-    _draw_slice(axes, mapped, colours, title, cmap="tab20", vmin=-0.5, vmax=19.5)
-
-
-def policy_figure(mapped: PolicyMap, action: int = 0) -> Figure:
-    """Plot the value, an action by its index, its local gain and the active sets of a map."""
-    figure = Figure(figsize=(12, 9), layout="constrained")
-    (value, policy), (gain, sets) = figure.subplots(2, 2)
-    u, name = mapped.actions[..., action], f"{{{action + 1}}}"
-    images = [_draw_slice(value, mapped, mapped.values, "Value $V(s)$", cmap="viridis")]
-    size = max(1e-12, u.nan_to_num().abs().max().item())
-    title = rf"Policy $\pi_{name}(s)$"
-    images.append(_draw_slice(policy, mapped, u, title, cmap="RdBu_r", vmin=-size, vmax=size))
-    slope = mapped.gains[..., action, :].norm(dim=-1)
-    title = rf"Local gain $\|d\pi_{name} / ds\|$"
-    images.append(_draw_slice(gain, mapped, slope, title, cmap="magma"))
-    for axes, image in zip((value, policy, gain), images, strict=True):
-        figure.colorbar(image, ax=axes, shrink=0.85)
-    _draw_regions(sets, mapped)
     return figure
 
 

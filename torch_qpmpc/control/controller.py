@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,9 +21,6 @@ from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, read_measured, read_row
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
-
-if TYPE_CHECKING:
-    from torch_qpmpc.proofs import Answer
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
@@ -368,26 +365,21 @@ class Controller:
         self._law = law if report.kept else self._law
         return report
 
-    def review(
-        self, r: Any = None, known: Any = None, *, proofs: Mapping[str, Answer] | None = None
-    ) -> Review:
+    def review(self, r: Any = None, known: Any = None) -> Review:
         """Return findings about this design: numbers, and a remedy for each fault.
 
         They cover the cost, the terminal weight, the gains, the horizon, the disturbances, the
         scaling of signals, hard bounds that can leave no plan, the reach of set-points, the QP's
         condition, the loop without active bounds (its stability, margin and offset), the shares of
-        weights in the cost of a closed loop, and the C code's size and iterations.
+        weights in the cost of a closed loop, and the C code.
 
         Args:
             r: set-points that the inputs must reach, by default the last step's.
             known: a row of known signals that are held, by default the last step's or reset's, else
                 zero. The finding about set-points shows them.
-            proofs: claims about the policy, by name: answers of `torch_qpmpc.proofs` about ``mpc``.
-                A claim that is not proved is a fault.
 
         Raises:
-            QPError: r or known is invalid, or a proof is about another QP, such as this one before
-                learning.
+            QPError: r or known is invalid.
             SolverError: the bounds of the inputs admit no steady state.
 
         Example:
@@ -398,7 +390,7 @@ class Controller:
             >>> review.faults[0].name, review.faults[0].remedy
             ('set-points', 'Set y1 to 5, not 7, or widen u_bounds of u1.')
         """
-        return review(self._law.renewed(), self._memory, r, known, proofs)
+        return review(self._law.renewed(), self._memory, r, known)
 
     def export_c(
         self,
@@ -413,11 +405,7 @@ class Controller:
 
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
         input and the active sets of all QPs in the state. With a C compiler, a closed loop is
-        compared with this controller's. ``main.c`` and a ``Makefile`` run the closed loop with the
-        model as a plant. It starts where the last `reset` rests, or else in the middle of the
-        bounds, and goes to the last set-point, or to one near the start. A later export keeps both
-        files as yours, and its report names them; an old ``main.c`` does not compile with a
-        controller of other sizes.
+        compared with this controller's.
 
         Args:
             folder: the folder of the files, created if it does not exist.

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
 from torch_qpmpc.control.disturbance import PREFIX, Disturbances, Steady
@@ -200,6 +201,21 @@ class Design:
             for of, bounds in zip(self.limited, (self.y_bounds, self.u_bounds), strict=True)
         )
         return (y[..., 0, :], y[..., 1, :]), (u[..., 0, :], u[..., 1, :])
+
+    def costs(
+        self, y: Tensor, r: Tensor, u: Tensor, u_s: Tensor, du: Tensor, known: Tensor
+    ) -> Tensor:
+        """Return the cost of each step, ``(*batch,)``; see `Run.costs`."""
+        parts = (y - r, self.Q), (u - u_s, self.R), (du, self.dR)
+        cost = sum(((x @ torch.as_tensor(W)) * x).sum(-1) for x, W in parts)
+        for name, price in self.linear.items():
+            signal = isinstance(price, str)
+            level = known[..., self.plant.known.index(price)] if signal else price
+            cost = cost + level * u[..., self.plant.inputs.index(name)]
+        lower, upper = map(torch.as_tensor, self.bounds_at(known.numpy())[0])
+        outside = (lower - y).relu() + (y - upper).relu()
+        prices = torch.where(outside > 0, torch.as_tensor(self.y_slack), 0.0)  # inf times 0 is none
+        return cost + (prices * outside).sum(-1)
 
     def arranged(
         self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any, level: Any

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,12 +16,13 @@ import numpy as np
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.simulation import Course, at_rest, centre, last_known, own_loop
+from torch_qpmpc.control.simulation import at_rest, centre, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.library import FLAGS, compiled, compiler
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
+from torch_qpmpc.loops import Step, run_loop
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
 COMPARED, REPLAYED = 200, 10
@@ -40,7 +41,6 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
-        kept: an older ``main.c`` or ``Makefile`` that differs from this export's.
         plan, target: the reports of the plan's and the target's QPs.
         free: the report of the QP of inputs that the target leaves free, None without one.
         table_bytes: the size of all constant tables, without self-tests.
@@ -50,7 +50,6 @@ class ControllerExport:
     """
 
     files: tuple[Path, ...]
-    kept: tuple[Path, ...]
     plan: Export
     target: Export
     free: Export | None
@@ -68,11 +67,7 @@ class ControllerExport:
             else f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
         )
         sizes = f"tables {self.table_bytes:,} bytes{state}"
-        lines = [", ".join(map(str, self.files)), sizes, compared]
-        if self.kept:
-            kept = ", ".join(map(str, self.kept))
-            lines.append(f"kept, not written: {kept}; delete what is not yours and export again")
-        return "\n".join(lines)
+        return "\n".join([", ".join(map(str, self.files)), sizes, compared])
 
 
 class Loop(NamedTuple):
@@ -86,6 +81,52 @@ class Loop(NamedTuple):
     known: Array
     u: Array
     start: Array
+
+
+class Course(NamedTuple):
+    """Signals of a loop with the controller's own model, by step.
+
+    Attributes:
+        x: the state that the model starts from, ``(n,)``.
+        load: a constant that is added to the inputs, ``(m,)``.
+        noise: what is added to the outputs, ``(T + 1, n_y)``.
+        r, known: set-points and known signals of the stages, ``(T + 1, rows, ..)``.
+    """
+
+    x: Array
+    load: Array
+    noise: Array
+    r: Array
+    known: Array
+
+
+def own_loop(
+    law: Law, course: Course, policy: Callable[[Signals], Any], steps: int
+) -> Iterator[tuple[Signals, Any]]:
+    """Yield the signals and the move of each step of a loop with the law's own model.
+
+    It ends where no input satisfies the hard bounds, or an output is above `Law.max_plausible`.
+    """
+    plant, x, k = law.design.plant, course.x, 0
+
+    def seen() -> Signals:
+        return Signals(plant.C @ x + course.noise[k], course.r[k], course.known[k])
+
+    def step(move: Any) -> Step:
+        nonlocal x, k
+        x = plant.A @ x + plant.B @ (move.u + course.load)
+        x = x + plant.E @ course.known[k][0] + plant.offset
+        k += 1
+        return Step(seen(), move)
+
+    signals = seen()
+    for after, move, _ in run_loop(policy, signals, step, steps):
+        if move.status:
+            return
+        yield signals, move
+        if (np.abs(after.y) > law.max_plausible[0]).any():
+            return
+        signals = after
 
 
 class CompiledController:
@@ -177,25 +218,18 @@ def export_controller(
         if (failed := library.selftest()) or not (difference <= near).all():
             got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
             raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
-    example = {"main.c": _main(law, memory, name, dtype), "Makefile": filled("controller.mk", name)}
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
         (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
         (folder / file).write_text(text, encoding="utf-8")
-    kept = []
-    for file, text in example.items():
-        if not (path := folder / file).exists():
-            path.write_text(text, encoding="utf-8")
-        elif path.read_bytes() != text.encode():
-            kept.append(path)
+    own = sum(x.size for x in _tables(law, dtype).values()) * np.dtype(dtype).itemsize
     return ControllerExport(
-        tuple(folder / file for file in (*texts, *example)),
-        tuple(kept),
+        tuple(folder / file for file in texts),
         plan,
         target,
         free,
-        sum(part.table_bytes for part in reports) + own_bytes(law, dtype)[0],
+        sum(part.table_bytes for part in reports) + own,
         state_bytes,
         len(loop.u),
         None if difference is None else float(difference.max()),
@@ -212,15 +246,6 @@ def undetermined(mpc: LinearMPC) -> str:
         return ""  # else 1 / PREFERENCE is the QP's condition
     moved = steady.Y[:, steady.n_a :].any(-1)
     return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
-
-
-def own_bytes(law: Law, dtype: str) -> tuple[int, int]:
-    """Return the bytes of a controller's tables and state in C without its QPs."""
-    real, size = np.dtype(dtype).itemsize, _sizes(law)
-    reals = size["N_E"] + size["N_X"] + 2 * size["N_U"] + (size["SET_POINTS"] + 1) * size["N_Y"]
-    reals += size["N_D_"] + law.mpc.n_p
-    tables = sum(x.size for x in _tables(law, dtype).values())
-    return tables * real, (reals + 1) * real  # the state ends with an int
 
 
 def _course(law: Law, known: Array) -> tuple[Course, Array]:
@@ -381,37 +406,3 @@ def _moves(mpc: LinearMPC, dtype: str) -> Array:
     size = np.where(size > 0, size, design.scaling.u)
     room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(design.u_bounds)
     return bounds + np.array([[-1], [1]]) * room
-
-
-def _main(law: Law, memory: Memory, name: str, dtype: str) -> str:
-    """Return a program of the closed loop with the model and a load.
-
-    It starts from the last reset's rest, or `at_rest`, and moves to the last set-point or one near.
-    """
-    design, known = law.design, last_known(law.design, memory)
-    plant, sizes = design.plant, _sizes(law)
-    x, u = at_rest(law.mpc, known)
-    load = 0.1 * plant.B @ design.scaling.u + plant.E @ known + plant.offset
-    middle_y, (y_rest, u_rest) = centre(design, known), memory.rest
-    if y_rest is not None or u_rest is not None:
-        u = np.clip(np.zeros(len(u)), *design.u_bounds) if u_rest is None else u_rest
-        x = design.scaling.at_rest(plant, u, known, y_rest)
-        middle_y = plant.C @ x
-    r = middle_y + 0.25 * design.usual
-    r = np.tile(law.mpc.target(r, known=known).y.numpy(), (sizes["SET_POINTS"], 1))
-    if len(memory.r):
-        r = law.read_set_points(None, sizes["SET_POINTS"], memory.r)
-    arrays = {
-        "A": plant.A,
-        "B": plant.B,
-        "C": plant.C,
-        "LOAD": load,
-        "R": r.ravel(),
-        "KNOWN": np.tile(known, sizes["STAGES"]),
-        "START_X": x,
-        "START_U": u,
-    }
-    tables = "\n".join(["enum { STEPS = 200 };", *(array(k, x, dtype) for k, x in arrays.items())])
-    fixed = ("N_X", "N_U", "N_Y", "N_D", "STAGES", "SET_POINTS")
-    other = " || ".join(f"{name.upper()}_{key} != {sizes[key]}" for key in fixed)
-    return filled("controller_main.c", name, {"/* @PLANT@ */": tables, "@OTHER@": other})

@@ -271,15 +271,10 @@ class Law:
     def read_known(
         self, known: Any, rows: int, least: int | None = None, sane: bool = True
     ) -> Array:
-        """Return known signals, in the forms of `Controller.step`, as ``(rows, n_d)``.
-
-        Args:
-            known: one row, or at least ``least`` rows, by default all.
-            rows, least: numbers of rows.
-            sane: see `read`.
+        """Return known signals ``(rows, n_d)``, from one row or at least ``least``, by default all.
 
         Raises:
-            QPError: they are invalid or missing.
+            QPError: they are missing, or invalid; see `read`.
         """
         names = self.design.plant.known
         if not names and known is None:
@@ -291,16 +286,10 @@ class Law:
         return self.read("known", known, rows, rows if least is None else least, sane)
 
     def read_set_points(self, r: Any, rows: int, last: Array, sane: bool = True) -> Array:
-        """Return set-points, in the forms of `Controller.step`, as ``(rows, n_y)``.
-
-        Args:
-            r: set-points, by default the ``last`` ones.
-            rows: the number of rows.
-            last: the set-points of the last step, without rows before the first.
-            sane: see `read`.
+        """Return set-points ``(rows, n_y)``, by default the ``last`` ones.
 
         Raises:
-            QPError: they are invalid, or None in the first step.
+            QPError: they are None in the first step, or invalid; see `read`.
         """
         outputs = self.design.plant.outputs
         if r is None and not len(last) and self.design.Q.any():

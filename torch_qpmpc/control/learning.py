@@ -354,17 +354,8 @@ class ControlledPlant(SimulatedPlant):
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return `Run.costs` of a step, ``(count,)``."""
         base, u_last, r, u_s, _ = s.split(self._ends, -1)
-        y, u, design, d = self._parts(base)[2], self._input(s, a), self._design, self._ahead(base)
-        parts = (y - r, design.Q), (u - u_s, design.R), (u - u_last, design.dR)
-        cost = sum(((x @ torch.as_tensor(W)) * x).sum(-1) for x, W in parts)
-        for name, price in design.linear.items():
-            known = isinstance(price, str)
-            level = d[:, 0, design.plant.known.index(price)] if known else price
-            cost = cost + level * u[:, design.plant.inputs.index(name)]
-        lower, upper = map(torch.as_tensor, design.bounds_at(d[:, 0].numpy())[0])
-        outside = (lower - y).relu() + (y - upper).relu()
-        prices = torch.where(outside > 0, torch.as_tensor(design.y_slack), 0.0)
-        return cost + (prices * outside).sum(-1)
+        y, u, d = self._parts(base)[2], self._input(s, a), self._ahead(base)[:, 0]
+        return self._design.costs(y, r, u, u_s, u - u_last, d)
 
     def _aims(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw set-points ``(count, n_y)``."""

@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from io import BytesIO
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.checks import check_kind
 from torch_qpmpc.control.design import Design, middle
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
-from torch_qpmpc.control.exporting import WEIGHT, own_bytes, undetermined
+from torch_qpmpc.control.exporting import WEIGHT, undetermined
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.observer import kalman
-from torch_qpmpc.control.simulation import last_known, probe
+from torch_qpmpc.control.simulation import at_rest, centre, last_known, simulate
 from torch_qpmpc.control.state_space import Array
-from torch_qpmpc.errors import QPError
-from torch_qpmpc.export.tables import SINGULAR, Tables, digest, make_tables
-from torch_qpmpc.export.writer import Settings, state_bytes, table_bytes
+from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.export.tables import SINGULAR, Tables, make_tables
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solve import solve_qp
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from torch_qpmpc.proofs import Answer
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, CONDITION, HIDDEN = 0.3, 1e8, 1e-3
@@ -43,6 +33,9 @@ MARGIN, CONDITION, HIDDEN = 0.3, 1e8, 1e-3
 NOISY = 1.1
 #: An output's weight with a smaller share of the cost does not matter; one that does.
 IDLE, NOTED = 1e-6, 1e-2
+#: Steps of the loop that shows the shares, and of each of its set-points, which are these shares
+#: of the outputs' sizes from the middle; and its load, relative to the inputs' sizes.
+PROBED, HELD, MOVE, LOAD = 100, 25, 0.5, 0.1
 #: Offsets relative to half the distance of an output's bounds.
 OFFSET = 1e-6
 #: The most times that a set-point is replaced by its nearest one, which soft bounds may move again.
@@ -56,16 +49,6 @@ SLOWEST, PATIENCE = 8, 10
 DAMP = "Raise dR tenfold."
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
-
-
-PAGE = """<!doctype html>
-<meta charset="utf-8">
-<title>Review of a controller</title>
-<style>body {{ font-family: sans-serif; max-width: 60em; margin: 2em auto }}
-td {{ vertical-align: top; padding: 0.2em 1em 0.2em 0 }} img {{ max-width: 100% }}</style>
-<h1>Review of a controller</h1>
-<table><tr><th>Finding<th><th>Numbers<th>Remedy{table}</table>{images}
-"""
 
 
 @dataclass(frozen=True)
@@ -115,26 +98,8 @@ class Review:
             lines += [f"      {finding.remedy}"] * (not finding.ok)
         return "\n".join(lines)
 
-    def to_html(self, path: str | Path, *figures: Figure) -> None:
-        """Write one page with a table of the findings and ``figures``, such as a `Run`'s."""
-        table = images = ""
-        for x in self.findings:
-            cells = (x.name, "ok" if x.ok else "fault", x.text, x.remedy)
-            table += "\n<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
-        for figure in figures:
-            figure.savefig(buffer := BytesIO(), format="png")
-            data = base64.b64encode(buffer.getvalue()).decode()
-            images += f'\n<img alt="" src="data:image/png;base64,{data}">'
-        Path(path).write_text(PAGE.format(table=table, images=images), encoding="utf-8")
 
-
-def review(
-    law: Law,
-    memory: Memory,
-    r: Any = None,
-    known: Any = None,
-    proofs: Mapping[str, Answer] | None = None,
-) -> Review:
+def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review:
     """Return the findings about a controller; see `Controller.review`."""
     mpc, design, r_last = law.mpc, law.design, memory.r
     if r is not None:
@@ -151,10 +116,8 @@ def review(
         _hard_rows(mpc, r_last, known),
         _set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
-    qp = digest(mpc.quadratic_program())
-    claims = [_proof(name, answer, qp) for name, answer in (proofs or {}).items()]
     if not cost.ok:
-        return Review([*findings, *claims])
+        return Review(findings)
     plan, target = make_tables(mpc), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(mpc, law.observer, plan, target)
@@ -164,22 +127,12 @@ def review(
         findings += [_margin(loop, law, plan, target), _offset(loop, design)]
         if design.plant.noise is not None:
             findings.append(_noise(loop, law, plan, target, design.plant.noise))
-    settings = Settings("policy", "float64", "fast", 1)
-    tables, state = own_bytes(law, settings.dtype)
-    sizes: dict[str, Any] = {
-        "bytes of tables": tables + sum(table_bytes(x, settings) for x in qps),
-        "bytes of the state": state + sum(state_bytes(x, settings) for x in qps),
-        "rows": sum(len(x.rows) for x in qps),
-    }
-    seen = probe(law, known)
-    findings.append(_weights(design, seen.shares))
-    if len(seen.iterations):
-        sizes |= {"least iterations of a step in the loop, on average": seen.iterations.mean()}
-        sizes |= {"and in its worst step": seen.iterations.max()}
+    sizes: dict[str, Any] = {"rows": sum(len(x.rows) for x in qps)}
+    findings.append(_weights(law, known))
     if names := undetermined(mpc):
         sizes["outputs whose bounds export_c refuses"] = names
     findings.append(Finding("C code", not names, sizes, WEIGHT.format(names) * bool(names)))
-    return Review([*findings, *claims])
+    return Review(findings)
 
 
 def _cost(mpc: LinearMPC) -> Finding:
@@ -510,9 +463,31 @@ def _offset(loop: LinearLoop, design: Design) -> Finding:
     return Finding("offset", ok, numbers, remedy * (not ok))
 
 
-def _weights(design: Design, shares: Mapping[str, float]) -> Finding:
-    """Each output's weight matters for the cost of a closed loop."""
+def _weights(law: Law, known: Array) -> Finding:
+    """Each output's weight matters for the cost of a closed loop with moving set-points and a load.
+
+    By the envelope theorem a weight's share of the cost J is d log J / d log weight, as the inputs
+    are nearly optimal for the weights. With entries off the diagonal it is a row's, which may be
+    negative.
+    """
+    design, rng = law.design, np.random.default_rng(0)
     names, Q = design.plant.outputs, design.Q
+    moves = rng.uniform(-1, 1, (-(-PROBED // HELD), len(Q))).repeat(HELD, 0)
+    options: dict[str, Any] = dict(zip("xu", at_rest(law.mpc, known), strict=True))
+    options |= {"known": known, "load": LOAD * design.scaling.u}
+    r, costs = centre(design, known) + MOVE * design.scaling.y * moves, {}
+    with suppress(QPError, SolverError):  # no plan, or outputs that overflow
+        run = simulate(law, Memory(options["u"]), None, PROBED, r, **options)
+        du = np.diff(run.u, axis=0, prepend=run.u_last[None])
+        for name, W, x, of in (
+            ("Q", Q, run.y[:-1] - run.r[:-1], names),
+            ("R", design.R, run.u - run.u_s, design.plant.inputs),
+            ("dR", design.dR, du, design.plant.inputs),
+        ):
+            parts = (x * (x @ W)).sum(0)
+            costs |= {f"{name} of {of[i]}": parts[i] for i in np.flatnonzero(W.any(0))}
+    whole = sum(costs.values()) or 1.0
+    shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
     remedies = []
     for i in np.flatnonzero(Q.any(0)):
@@ -521,26 +496,6 @@ def _weights(design: Design, shares: Mapping[str, float]) -> Finding:
             to = f"Raise Q of {names[i]} to {NOTED / share * Q[i, i]:.1g}, or leave" * (share > 0)
             remedies.append(f"{to or 'Leave'} it out: {names[i]} does not matter.")
     return Finding("weights", not remedies, numbers, " ".join(remedies))
-
-
-def _proof(name: str, answer: Answer, digest: str) -> Finding:
-    """A claim about the policy is proved; of a refuted one, the worst run is shown."""
-    from torch_qpmpc.proofs import Answer  # imports scipy.optimize
-
-    check_kind("proofs", answer, Answer, "Pass what a question of torch_qpmpc.proofs returns.")
-    if answer.digest != digest:
-        remedy = "Ask again, after the controller has changed."
-        raise QPError.expected(f"the proof of {name!r}", "another QP's", "this QP's", remedy)
-    numbers = {answer.question: answer.value, "proved bound": answer.bound}
-    numbers |= {"nodes": answer.nodes, "binaries": answer.binaries}
-    if answer.proved:
-        return Finding(name, True, numbers)
-    if not answer.refuted:
-        return Finding(name, False, numbers, "It is undecided: give it more seconds.")
-    numbers |= {"from p": answer.states[0]}
-    numbers |= {f"d_{k}": d for k, d in enumerate(answer.disturbances) if len(d)}
-    remedy = "Claim it of a smaller set, or of smaller disturbances, or tighten the bounds."
-    return Finding(name, False, numbers, remedy)
 
 
 def _number(x: Any) -> str:

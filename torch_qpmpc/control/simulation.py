@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,11 +19,6 @@ from torch_qpmpc.loops import Step, run_loop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-#: Steps of the probe, and of each of its set-points.
-PROBED, HELD = 100, 25
-#: Its set-points and load, relative to half of the bounds' distance.
-MOVE, LOAD = 0.5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,21 +58,9 @@ class Run:
         It is ``(y - r)'Q(y - r) + (u - u_s)'R(u - u_s) + du'dR du``, with prices and the price of
         violations of outputs' bounds.
         """
-        design, y = self.design, self.y[:-1]
-        parts = (
-            (y - self.r[:-1], design.Q),
-            (self.u - u_s, design.R),
-            (np.diff(self.u, axis=0, prepend=self.u_last[None]), design.dR),
-        )
-        cost = sum(np.einsum("ki,ij,kj->k", x, weight, x) for x, weight in parts)
-        for name, price in design.linear.items():
-            known = isinstance(price, str)
-            level = self.known[:, design.plant.known.index(price)] if known else price
-            cost = cost + level * self.u[:, design.plant.inputs.index(name)]
-        lower, upper = design.bounds_at(self.known)[0]
-        outside = np.maximum(np.maximum(lower - y, y - upper), 0.0)
-        prices = np.where(outside > 0, design.y_slack, 0.0)  # inf times zero is none
-        return cost + (prices * outside).sum(1)
+        du = np.diff(self.u, axis=0, prepend=self.u_last[None])
+        signals = self.y[:-1], self.r[:-1], self.u, u_s, du, self.known
+        return self.design.costs(*map(torch.from_numpy, signals)).numpy()
 
     def plot(self) -> Figure:
         """Return a figure with a panel for each output, input and known signal."""
@@ -245,97 +227,3 @@ def at_rest(mpc: LinearMPC, known: Array) -> tuple[Array, Array]:
     """Return x and u of the model at rest as near to `centre` as its bounds allow."""
     rest = mpc.target(centre(mpc.design, known), known=known)
     return rest.x.numpy(), rest.u.numpy()
-
-
-class Course(NamedTuple):
-    """Signals of a loop with the controller's own model, by step.
-
-    Attributes:
-        x: the state that the model starts from, ``(n,)``.
-        load: a constant that is added to the inputs, ``(m,)``.
-        noise: what is added to the outputs, ``(T + 1, n_y)``.
-        r, known: set-points and known signals of the stages, ``(T + 1, rows, ..)``.
-    """
-
-    x: Array
-    load: Array
-    noise: Array
-    r: Array
-    known: Array
-
-
-def own_loop(
-    law: Law, course: Course, policy: Callable[[Signals], Any], steps: int
-) -> Iterator[tuple[Signals, Any]]:
-    """Yield the signals and the move of each step of a loop with the law's own model.
-
-    It ends where no input satisfies the hard bounds, or an output is above `Law.max_plausible`.
-    """
-    plant, x, k = law.design.plant, course.x, 0
-
-    def seen() -> Signals:
-        return Signals(plant.C @ x + course.noise[k], course.r[k], course.known[k])
-
-    def step(move: Any) -> Step:
-        nonlocal x, k
-        x = plant.A @ x + plant.B @ (move.u + course.load)
-        x = x + plant.E @ course.known[k][0] + plant.offset
-        k += 1
-        return Step(seen(), move)
-
-    signals = seen()
-    for after, move, _ in run_loop(policy, signals, step, steps):
-        if move.status:
-            return
-        yield signals, move
-        if (np.abs(after.y) > law.max_plausible[0]).any():
-            return
-        signals = after
-
-
-class Probe(NamedTuple):
-    """A closed loop's verdict on the weights and the QP.
-
-    Attributes:
-        shares: the share of each weight in the loop's cost J, the largest first. By the envelope
-            theorem it is d log J / d log weight, as the inputs are nearly optimal for the weights.
-            With entries off the diagonal it is a row's, which may be negative.
-        iterations: the changes of the plan's active set in a step, and one: a lower bound of the
-            iterations in C from the last active set.
-    """
-
-    shares: dict[str, float]
-    iterations: Array
-
-
-@torch.no_grad()
-def probe(law: Law, known: Array) -> Probe:
-    """Run a loop with moving set-points and a load, from rest near `centre`."""
-    design, rng = law.design, np.random.default_rng(0)
-    plant, size_y, size_u = design.plant, design.scaling.y, design.scaling.u
-    (x, u), rows = at_rest(law.mpc, known), design.horizon + 1
-    moves = rng.uniform(-1, 1, (-(-PROBED // HELD), len(size_y))).repeat(HELD, 0)
-    r = centre(design, known) + MOVE * size_y * np.vstack((moves[:PROBED], moves[-1:]))
-    constant = np.tile(known, (PROBED + 1, rows, 1))
-    quiet = np.zeros((PROBED + 1, len(size_y)))
-    course = Course(x, LOAD * size_u, quiet, r[:, None].repeat(rows, 1), constant)
-    costs: dict[str, float] = {}
-    states, last = [], u
-    for signals, move in own_loop(law, course, law.policy(law.begun(u, True)), PROBED):
-        states.append(move.p)
-        for name, weight, signal, names in (
-            ("Q", design.Q, signals.y - _first(move.target.y), plant.outputs),
-            ("R", design.R, move.u - _first(move.target.u), plant.inputs),
-            ("dR", design.dR, move.u - last, plant.inputs),
-        ):
-            for i in np.flatnonzero(weight.any(0)):
-                key = f"{name} of {names[i]}"
-                costs[key] = costs.get(key, 0.0) + float(signal[i] * (weight[i] @ signal))
-        last = move.u
-    whole = sum(costs.values()) or 1.0
-    shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
-    changes = np.zeros(0)
-    if states:
-        active = law.mpc.solve(torch.stack(states)).active.numpy()
-        changes = (np.diff(active, axis=0, prepend=0 * active[:1]) != 0).sum(-1)
-    return Probe(shares, 1 + changes)

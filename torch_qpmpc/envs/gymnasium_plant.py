@@ -131,23 +131,6 @@ class GymnasiumPlant:
         env.set_seed(seed)
         return env
 
-    def is_reproducible(self) -> bool:
-        """Return True if five steps of two episodes with one seed and its actions are equal."""
-
-        def episode() -> np.ndarray:
-            env = self.make()
-            env.action_space.seed(0)
-            signals = [np.ravel(env.reset(seed=0)[0])]
-            for _ in range(5):
-                s, reward, terminated, truncated, _ = env.step(env.action_space.sample())
-                signals += [np.ravel(s), np.array([float(reward)])]
-                if terminated or truncated:
-                    break
-            env.close()
-            return np.concatenate(signals)
-
-        return np.array_equal(episode(), episode(), equal_nan=True)
-
     def violation(self, s: Tensor) -> Tensor:
         """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``.
 

@@ -118,7 +118,7 @@ def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]
             regulated = start._replace(riccati=start.cost is not None)
             make_mpc(cfg, start.plant(physics), regulated)
             named[name] = regulated
-    if not outputs.layout.n_d and cfg.export is None and cfg.constraint.si is None:
+    if not outputs.layout.n_d and cfg.constraint.si is None:
         blended = identify_blended(outputs.log, 2 * N)
         unexplained = {count: 1 - R2 for count, R2 in blended.R2.items()}
         if min(unexplained.values()) < BLENDED_SHARE * unexplained[1]:

@@ -150,7 +150,6 @@ class Config(Group):
     logger: Annotated[
         Literal["tensorboard", "csv", "wandb", "mlflow"], AfterValidator(_installed_logger)
     ]
-    export: Literal["c"] | None
     figures: bool
     rivals: bool | list[str]
     eval_interval: Count
@@ -194,8 +193,6 @@ class Config(Group):
         if part.si and not self.replay:
             remedy = "constraint.si samples from the replay; constraint=deviation has no si."
             self.conflict("replay", "true", remedy)
-        if self.task.name not in TASKS:  # its script has not run
-            return self
         task = find_task(self.task.model_dump())
         if self.noise.name not in task.noises:
             self.conflict("noise.name", f"a noise of task {task.name}: {', '.join(task.noises)}")

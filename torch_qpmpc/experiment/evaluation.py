@@ -6,7 +6,6 @@ All have the same starts and disturbances. All but the learned policy are evalua
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,7 +16,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -26,12 +24,6 @@ from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
 from torch_qpmpc.experiment.tasks.identified import nominal_mpcs
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
-
-UNPAIRED = (
-    "Two episodes of {id!r} with one seed and the same actions differ: policies are compared on "
-    "different episodes, and the gate's pairs are not pairs. Draw all of the environment's random "
-    "numbers from the seed of reset."
-)
 
 
 def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
@@ -99,8 +91,6 @@ class Evaluation:
         cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC, quiet: bool = True
     ) -> Evaluation:
         """Evaluate before learning, when ``mpc`` is the start and what has been learned."""
-        if isinstance(physics, GymnasiumPlant) and not physics.is_reproducible():
-            warnings.warn(UNPAIRED.format(id=physics.id), UserWarning, stacklevel=2)
         policies: dict[str, Callable[[], Policy]] = {"start": lambda: warm_policy(mpc)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:
             policies["true model"] = lambda: warm_policy(true_mpc)

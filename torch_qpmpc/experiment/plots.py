@@ -90,9 +90,9 @@ def draw_learning(
     draw_lines(axes, evaluation.lines())
     axes.set(xlabel="update", ylabel="J, mean over starts")
     scale_costs(axes)
-    first, each, unit = experience(evaluation.cfg)
+    first, each = experience(evaluation.cfg)
     ticks: Any = (lambda k: first + each * k, lambda x: (x - first) / each)
-    axes.secondary_xaxis("top", functions=ticks).set_xlabel(unit)
+    axes.secondary_xaxis("top", functions=ticks).set_xlabel("transitions")
     axes.legend(fontsize="x-small", loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
 
 
@@ -117,14 +117,13 @@ def scale_costs(axes: Axes) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def experience(cfg: DictConfig) -> tuple[float, float, str]:
-    """Return the experience before the first update, log included, that of each, and its unit."""
-    length, unit = find_task(cfg.task).unit
+def experience(cfg: DictConfig) -> tuple[int, int]:
+    """Return the transitions before the first update, log included, and those of each."""
     each = cfg.num_envs * cfg.steps_per_update
     first = each * warm_up_batches(cfg)
     if cfg.start.name == "data" and cfg.start.file is None:
         first += cfg.start.transitions
-    return first / length, each / length, f"{unit} of experience"
+    return first, each
 
 
 def summary_figure(

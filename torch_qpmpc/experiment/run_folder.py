@@ -6,7 +6,6 @@ import io
 import json
 import math
 import os
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from torchrl.record.loggers import Logger, get_logger
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import load_config, settings
 from torch_qpmpc.experiment.tasks.code import COMMAND
-from torch_qpmpc.export.export import export_c
 from torch_qpmpc.files import damaged, read_tensors, write_whole
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -57,8 +55,6 @@ def learned_qp(folder: str | Path) -> QPMPC:
     return QPMPC.load(Path(folder) / (BEST if cfg.gate else CHECKPOINT))
 
 
-#: The folder of the C files in that of the run.
-C_FOLDER = "c"
 #: Entries of summary.json that are numbers or, if they are not finite, null.
 NUMBERS = ("seed", "closed_gap", "J_start", "J_best", "J_final", "J_true_model")
 NUMBERS += ("canonical_distance",)
@@ -68,7 +64,7 @@ class RunFolder:
     """The output of one run; a context manager, which flushes at its end.
 
     Scalars go to metrics.csv and to one of TorchRL's loggers. A resumed run keeps the rows up to
-    the update ``after``, None in a new one; `QPError` where some are missing or damaged.
+    the update ``after``, None in a new one; `QPError` where they are damaged.
     """
 
     def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
@@ -76,7 +72,7 @@ class RunFolder:
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
         # Read before the first event is written: damaged rows stop the run.
-        earlier: Any = () if after is None else _read_until(self.path, cfg, after).iterrows()
+        earlier: Any = () if after is None else read_metrics(self.path).loc[:after].iterrows()
         self.rows: list[dict[str, float]] = [{"update": k, **row.dropna()} for k, row in earlier]
         self.cfg = cfg
         self.logger = make_logger(cfg, self.path)
@@ -124,18 +120,6 @@ class RunFolder:
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
-def export_run(mpc: QPMPC, folder: Path, quiet: bool) -> None:
-    """Write the policy as C into a run's folder; warn if that is not possible."""
-    try:
-        export = export_c(mpc, folder / C_FOLDER)
-    except QPError as error:
-        # The run's results are worth more than its export, which can be repeated.
-        warnings.warn(f"The policy is not exported. {error}", stacklevel=2)
-        return
-    if not quiet:
-        print(f"\n{export}")
-
-
 def make_logger(cfg: DictConfig, folder: Path) -> Logger:
     """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
     name = cfg.logger
@@ -160,7 +144,8 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
-        raise _damaged(file, str(error).strip().partition("\n")[0]) from error
+        remedy = "Resume from a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
+        raise damaged(file, error, "the table that a run wrote", remedy) from error
 
 
 def read_summary(folder: str | Path) -> dict[str, Any]:
@@ -179,32 +164,11 @@ def read_summary(folder: str | Path) -> dict[str, Any]:
         raise damaged(file, error, "the outcome that a run wrote") from error
 
 
-def _read_until(folder: Path, cfg: DictConfig, update: int) -> pd.DataFrame:
-    """Read the rows up to ``update``, and check that none that ``cfg`` demands is missing."""
-    table = read_metrics(folder)
-    due = {0, *range(cfg.log_interval, update + 1, cfg.log_interval)}
-    due |= {*range(cfg.eval_interval, update + 1, cfg.eval_interval)}
-    if missing := sorted(due - {*table.index}):
-        lost = ", ".join(map(str, missing[:5])) + (", .." if len(missing) > 5 else "")
-        raise _damaged(folder / "metrics.csv", f"no row for update {lost}")
-    if not table.index.is_monotonic_increasing or table.index.has_duplicates:
-        raise _damaged(folder / "metrics.csv", "its updates do not increase")
-    return table.loc[:update]
-
-
 def _finite(value: Any) -> Any:
     """Replace numbers that are not finite by None."""
     if isinstance(value, Mapping):
         return {key: _finite(entry) for key, entry in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _damaged(file: Path, reason: str) -> QPError:
-    remedy = (
-        "Restore the file, resume from a copy of the folder, or start a new run with "
-        "hydra.run.dir=FOLDER."
-    )
-    return damaged(file, ValueError(reason), "the table that a run wrote", remedy)
 
 
 class WritableFolder(Callback):

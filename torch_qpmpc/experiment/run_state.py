@@ -7,7 +7,7 @@ environments cannot be saved and start new episodes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -117,39 +117,22 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
     ``path`` is the run's folder or one of its checkpoints. Beside it, the command line's
     ``overrides`` may only name the code that the run needs, as in ``task.file=FILE``.
     """
-    given = {text.partition("=")[0].lstrip("+"): text for text in overrides}
+    given = {key: text.strip("'\"") for key, _, text in (x.partition("=") for x in overrides)}
     cfg, state = _stopped(path)
     code = named_code(cfg.task)
-    _check_alone(given, {"resume", *code, *(["task"] if "task.id" in code else [])})
-    if not has_run(cfg.task):
-        _check_named(given, code, path, cfg)
-    return cfg, state
-
-
-def _check_alone(given: Mapping[str, str], allowed: Collection[str]) -> None:
-    if others := [override for key, override in given.items() if key not in allowed]:
+    if others := given.keys() - {"resume", *code, *(["task"] if "task.id" in code else [])}:
+        got = f"it together with {', '.join(f'{key}={given[key]}' for key in sorted(others))}"
         remedy = "A run resumes with its own configuration."
-        got = f"it together with {', '.join(others)}"
         raise QPError.expected("resume", got, "no other override", remedy)
-
-
-def _check_named(
-    given: Mapping[str, str], code: Mapping[str, str], path: str | Path, cfg: DictConfig
-) -> None:
-    """Raise `QPError` unless the overrides name the ``code`` that the configuration names.
-
-    Another script may register the task, as on another computer, but not another environment.
-    """
-    named = {key: text.partition("=")[2].strip("'\"") for key, text in given.items()}
-    if code.keys() <= named.keys() and named.get("task.id") == code.get("task.id"):
-        return
-    words = ", ".join(f"{key}={value!r}" for key, value in code.items())
-    if cfg.task.get("kwargs"):
-        words += f" with task.kwargs={cfg.task.kwargs}"
-    got = f"{path}, whose config.yaml names {'other ' if 'task.id' in named else ''}code ({words})"
-    command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
-    remedy = f"Read that code, which may not be yours; to run it: {command}"
-    raise QPError.expected("resume", got, "code that the command line names, too", remedy)
+    # Another script may register the task, as on another computer, but not another environment.
+    same = code.keys() <= given.keys() and given.get("task.id") == code.get("task.id")
+    if not (same or has_run(cfg.task)):
+        words = ", ".join(f"{key}={value!r}" for key, value in code.items())
+        got = f"{path}, whose config.yaml names code ({words})"
+        command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
+        remedy = f"Read that code, which may not be yours; to run it: {command}"
+        raise QPError.expected("resume", got, "code that the command line names, too", remedy)
+    return cfg, state
 
 
 def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:

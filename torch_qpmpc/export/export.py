@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,16 +17,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.comparison import Agreement, choose, compare, states
 from torch_qpmpc.export.library import Library, Steps, compiler, required_compiler
 from torch_qpmpc.export.tables import Tables, make_tables
-from torch_qpmpc.export.writer import (
-    NEAR,
-    REAL,
-    Labels,
-    Settings,
-    header,
-    sources,
-    state_bytes,
-    table_bytes,
-)
+from torch_qpmpc.export.writer import NEAR, REAL, Settings, header, sources, table_bytes
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import ungraded
 
@@ -38,20 +28,12 @@ UNSOLVED = 0.1
 PER_ROW, AT_LEAST = 20, 100
 #: The causes of the codes.
 CODES = ("solved", "not certified within max_iterations", "infeasible", "invalid p")
-#: Names that the files would hide or that readers would take for something else.
-TAKEN = {
-    "a keyword of C or C++": """alignas alignof and and_eq asm auto bitand bitor bool break case
-        catch char class compl concept const const_cast consteval constexpr constinit continue
-        co_await co_return co_yield decltype default delete do double dynamic_cast else enum
-        explicit export extern false float for friend goto if inline int long mutable namespace new
-        noexcept not not_eq nullptr operator or or_eq private protected public register
-        reinterpret_cast requires restrict return short signed sizeof static static_assert
-        static_cast struct switch template this thread_local throw true try typedef typeid typename
-        typeof union unsigned using virtual void volatile wchar_t while xor xor_eq""",
-    "whose .h is a standard header": """assert complex ctype errno fenv inttypes iso646 limits
-        locale math setjmp signal stdalign stdarg stdatomic stdbool stddef stdint stdio stdlib
-        stdnoreturn string tgmath threads time uchar wchar wctype""",
-}
+#: Names whose .h would hide a standard header.
+HEADERS = (
+    "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal "
+    "stdalign stdarg stdatomic stdbool stddef stdint stdio stdlib stdnoreturn string tgmath "
+    "threads time uchar wchar wctype"
+)
 
 
 @dataclass(frozen=True)
@@ -64,7 +46,8 @@ class Export:
         n_p, n_u: the numbers of entries of p and u.
         rows: the number of rows with multipliers.
         variables: the number of free variables of a plan.
-        table_bytes, state_bytes: the sizes of the constant tables and of the state.
+        table_bytes, state_bytes: the sizes of the constant tables and of the state; the latter is
+            None without a compiler.
         condition: the condition number of the cost on the plan.
         agreement: the measured agreement with an exact solver; None without a compiler.
         digest: the SHA-256 of the nine tensors.
@@ -86,7 +69,7 @@ class Export:
     rows: int
     variables: int
     table_bytes: int
-    state_bytes: int
+    state_bytes: int | None
     condition: float
     agreement: Agreement | None
     digest: str
@@ -97,11 +80,11 @@ class Export:
             f"{', '.join(str(file) for file in self.files)}",
             f"{self.n_p} known entries, {self.n_u} actions, {self.rows} rows, "
             f"{self.variables} variables; {self.dtype}, {self.storage}",
-            f"tables {self.table_bytes:,} bytes, state {self.state_bytes:,} bytes; condition "
-            f"{self.condition:.1e}",
+            f"tables {self.table_bytes:,} bytes; condition {self.condition:.1e}",
             "not compared with a solver: no C compiler was found",
         ]
         if one := self.agreement:
+            lines[-2] += f"; state {self.state_bytes:,} bytes"
             lines[-1] = (
                 f"at {one.states} states: actions within {one.u:.1e}, values within "
                 f"{one.value:.1e} where solved ({one.solved}); {one.infeasible} infeasible, "
@@ -118,7 +101,6 @@ def export_c(
     name: str = "policy",
     max_iterations: int | None = None,
     storage: str = "fast",
-    labels: Labels | None = None,
 ) -> Export:
     """Write the policy and value of the current theta as C99 without heap or dependencies.
 
@@ -133,8 +115,6 @@ def export_c(
         max_iterations: the limit of a step; by default 20 per row of G on the plan, plus 100.
         storage: ``"fast"`` stores a table of rows by rows; ``"small"`` one of rows by free
             variables if that is smaller.
-        labels: names of the entries of ``"x"``, ``"u"`` and ``"d"``, with units, for the comment at
-            the head.
 
     Returns:
         Sizes, conditioning, and the measured agreement.
@@ -145,7 +125,7 @@ def export_c(
     """
     settings = Settings(name, dtype, storage, max_iterations)
     with tempfile.TemporaryDirectory() as temporary:
-        export, _ = _build(mpc, Path(temporary), settings, labels)
+        export, _ = _build(mpc, Path(temporary), settings)
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for file in export.files:
@@ -155,25 +135,23 @@ def export_c(
         )
 
 
-def _build(
-    mpc: QPMPC, folder: Path, settings: Settings, labels: Labels | None = None
-) -> tuple[Export, Library | None]:
+def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Library | None]:
     """Write, compile and check a policy in an existing folder."""
     name, dtype, storage, limit = settings
-    _check(mpc, settings, labels)
+    _check(mpc, settings)
     tables = make_tables(mpc)
     settings = settings._replace(
         max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST,
     )
     p, exact = states(mpc, tables, dtype)
-    examples, exact = choose(mpc, p, exact)
-    texts = sources(tables, settings, header(mpc, tables, settings, labels or {}), examples)
+    examples = choose(mpc, p, exact)
+    texts = sources(tables, settings, header(mpc, tables, settings), examples)
     for file, text in texts.items():
         (folder / file).write_text(text, encoding="utf-8")
     library, agreement = None, None
     if compiler() is not None:
         library = Library(folder, name, dtype)
-        agreement, error = compare(mpc, tables, library, p, exact)
+        agreement, error = compare(tables, library, p, exact)
         solvable, unsolved = agreement.solved + agreement.unsolved, agreement.unsolved
         if limit is None and unsolved > UNSOLVED * solvable:
             _refuse(dtype, f"{unsolved} of {solvable} states not certified", tables)
@@ -199,7 +177,7 @@ def _build(
         rows=len(tables.rows),
         variables=tables.R.shape[1],
         table_bytes=table_bytes(tables, settings),
-        state_bytes=state_bytes(tables, settings),
+        state_bytes=None if library is None else library.state_bytes,
         condition=tables.condition,
         agreement=agreement,
         digest=tables.digest,
@@ -215,22 +193,13 @@ def _refuse(dtype: str, got: str, tables: Tables) -> None:
     raise QPError.expected("dtype", f"{dtype!r}, with {got}", "a policy that agrees", remedy)
 
 
-def _check(mpc: QPMPC, settings: Settings, labels: Labels | None) -> None:
+def _check(mpc: QPMPC, settings: Settings) -> None:
     check_kind("mpc", mpc, QPMPC)
     check_choice("dtype", settings.dtype, tuple(REAL))
     check_choice("storage", settings.storage, STORAGES)
     check_name(settings.name)
     if settings.max_iterations is not None:
         check_whole("max_iterations", settings.max_iterations, 1)
-    sizes = {"x": mpc.n_x, "u": mpc.n_u, "d": mpc.n_d}
-    if labels is not None and not isinstance(labels, Mapping):
-        raise QPError.expected("labels", type(labels).__name__, "a mapping from x, u and d")
-    for key, names in (labels or {}).items():
-        check_choice("labels", key, tuple(sizes))
-        if not isinstance(names, Sequence) or isinstance(names, str) or len(names) != sizes[key]:
-            raise QPError.expected(f"labels[{key!r}]", repr(names), f"{sizes[key]} names")
-        if not all(isinstance(label, str) for label in names):
-            raise QPError.expected(f"labels[{key!r}]", repr(names), "strings")
 
 
 def check_name(name: str) -> None:
@@ -238,10 +207,9 @@ def check_name(name: str) -> None:
     remedy = "It begins the names of functions and files."
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise QPError.expected("name", repr(name), "a C identifier", remedy)
-    for kind, taken in TAKEN.items():
-        if name.lower() in taken.split():
-            got = f"{name!r}, {kind}"
-            raise QPError.expected("name", got, "another C identifier", f"{remedy} Append a _.")
+    if name.lower() in HEADERS.split():
+        got = f"{name!r}, whose .h is a standard header"
+        raise QPError.expected("name", got, "another C identifier", f"{remedy} Append a _.")
 
 
 class CompiledPolicy:

@@ -59,9 +59,6 @@ ROUNDING = 64
 REAL = {"float64": "double", "float32": "float"}
 WIDTH = 100
 
-#: Names of the entries of x, u and d.
-Labels = Mapping[str, Sequence[str]]
-
 
 class Example(NamedTuple):
     """A state of the self-test: p, and the expected code, u and value, of terms of a size."""
@@ -116,16 +113,25 @@ def filled(template: str, name: str, parts: Mapping[str, str] | None = None) -> 
     return text
 
 
-def header(mpc: QPMPC, tables: Tables, settings: Settings, labels: Labels) -> str:
+def header(mpc: QPMPC, tables: Tables, settings: Settings) -> str:
     """Return the comment at the head of both files."""
+    today, version = datetime.date.today(), sys.modules["torch_qpmpc"].__version__
+    stages = [(f"d_{k}", mpc.n_d) for k in range(mpc.horizon + 1) if mpc.n_d]
+    ends = np.cumsum([0, *(size for _, size in stages), mpc.n_x])
+    names = [name for name, _ in stages] + ["x_0"]
     lines = [
         f"{settings.name}: the policy and value of a quadratic program, by torch_qpmpc "
-        f"{sys.modules['torch_qpmpc'].__version__} on {datetime.date.today().isoformat()}.",
+        f"{version} on {today.isoformat()}.",
         f"SHA-256 of H, q, c, C, b, G, lb, ub, w: {tables.digest}",
         "",
-        *_layout(mpc, labels),
+        *(f"{_entries('p', *ends[i : i + 2])}: {name}" for i, name in enumerate(names)),
+        f"{_entries('u', 0, mpc.n_u)}: u_0",
     ]
     return comment(lines)
+
+
+def _entries(vector: str, start: int, end: int) -> str:
+    return f"{vector}[{start}]" if end == start + 1 else f"{vector}[{start} .. {end - 1}]"
 
 
 def comment(lines: Sequence[str]) -> str:
@@ -140,22 +146,6 @@ def _harmless(line: str) -> str:
         while ends in line:
             line = line.replace(ends, " ".join(ends))
     return line
-
-
-def _layout(mpc: QPMPC, labels: Labels) -> list[str]:
-    """Describe the entries of p and u."""
-    blocks = [("d", f"d_{k}", mpc.n_d) for k in range(mpc.horizon + 1) if mpc.n_d]
-    blocks.append(("x", "x_0", mpc.n_x))
-    lines, start = [], 0
-    for kind, name, size in blocks:
-        lines.append(_entries("p", start, size, name, labels.get(kind, ())))
-        start += size
-    return [*lines, _entries("u", 0, mpc.n_u, "u_0", labels.get("u", ()))]
-
-
-def _entries(vector: str, start: int, size: int, name: str, labels: Sequence[str]) -> str:
-    span = f"{start}" if size == 1 else f"{start} .. {start + size - 1}"
-    return f"{vector}[{span}]: {name}" + (f" ({', '.join(labels)})" if labels else "")
 
 
 def held(tables: Tables) -> int:
@@ -284,12 +274,3 @@ def table_bytes(tables: Tables, settings: Settings) -> int:
     """Return the size of all tables but those of the self-test."""
     numbers = sum(x.size for x in arrays_of(tables, settings).values()) + 1
     return numbers * np.dtype(settings.dtype).itemsize
-
-
-def state_bytes(tables: Tables, settings: Settings) -> int:
-    """Return the size of the state, with C's padding."""
-    size = {k: int(v) for k, v in sizes_of(tables, settings).items()}
-    reals = 5 * size["ROWS_"] + size["TRIANGLE"] + 3 * size["HELD_"] + size["WORK"] + size["N_U"]
-    real = np.dtype(settings.dtype).itemsize
-    total = reals * real + 4 * (size["HELD_"] + 1) + size["ROWS_"]
-    return -(-total // real) * real

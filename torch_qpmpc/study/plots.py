@@ -42,9 +42,9 @@ def draw_J(axes: Axes, frame: pd.DataFrame) -> None:
     """Draw J over experience, with means of the start's and the others' J as lines."""
     for label, runs in frame.groupby("label", sort=False):
         updates, J = curves(runs, "eval/J")
-        before, each, unit = experience(runs["run"].iloc[0].cfg)
+        before, each = experience(runs["run"].iloc[0].cfg)
         draw_band(axes, before + each * updates, J, str(label), colours(frame)[str(label)])
-        axes.set(xlabel=unit, ylabel="J")
+        axes.set(xlabel="transitions", ylabel="J")
     once = frame.drop_duplicates("seed")
     ends = {"start": once["J_start"], "true model": once["J_true_model"]}
     costs = {**ends, **pd.DataFrame(once["rivals"].tolist())}

@@ -54,7 +54,8 @@ class FinishedRun:
         """The run's configuration; `QPError` if it does not match this version's configs/."""
         cfg = load_config(self.folder / "config.yaml")
         try:
-            check_config(cfg)
+            if has_run(cfg.task):
+                check_config(cfg)
         except QPError as error:
             got, remedy = f"a run with other keys ({error})", "Repeat it, or move it elsewhere."
             raise QPError.expected(str(self.folder), got, "a run of this version", remedy) from None

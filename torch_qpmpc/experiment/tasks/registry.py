@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, Self
+from typing import Annotated, Any, Literal, Self
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
@@ -102,7 +102,6 @@ class Task:
         episode: returns arguments of `episode_figure` that show an episode of a plant in its own
             names and units, such as ``outputs`` or ``band``, from the known signals d of its steps
             ``(T + 1, n_d)``.
-        unit: the unit of experience in figures: its length in transitions, and its name.
         settings: the model of the keys under ``task``.
         defaults: settings of any group that differ from ``task=point_mass``, and under ``defaults``
             other choices of groups, as ``[{"override /constraint": "free"}]``; None if they are in
@@ -120,7 +119,6 @@ class Task:
     rivals: Mapping[str, Callable[[Any], Policy]] = field(default_factory=dict)
     nominal_scheme: Callable[[DictConfig, Any], Scheme] | None = None
     episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
-    unit: tuple[int, str] = (1, "transitions")
     settings: type[TaskSettings] = TaskSettings
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
 
@@ -195,28 +193,13 @@ def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
 
 
 def find_task(settings: Mapping[str, Any]) -> Task:
-    """Find a task by the keys under ``task``; without its script, which does not run, no plant."""
+    """Find a task by the keys under ``task``; raise `QPError` if its script has not run."""
     name, file = settings.get("name"), settings.get("file")
     if name in TASKS:
         return TASKS[name]
-    if isinstance(name, str) and isinstance(file, str):
-        return _without_code(name, file)
     got = repr(name) if "name" in settings else "nothing"
-    raise QPError.expected("task.name", got, f"one of {', '.join(TASKS)}")
-
-
-class _AnySettings(TaskSettings):
-    """The keys of a task whose own are unknown."""
-
-    model_config = ConfigDict(extra="allow", strict=True)
-
-
-def _without_code(name: str, file: str) -> Task:
-    """Make a stand-in for a task whose script has not run."""
-
-    def refuse(*_: Any) -> NoReturn:
-        got = f"{file!r}, which has not run"
-        remedy = "Name it on the command line with task.file=FILE, or run it before."
-        raise QPError.expected("task.file", got, f"a script that has registered {name!r}", remedy)
-
-    return Task(name, refuse, refuse, settings=_AnySettings)
+    if file is None:
+        raise QPError.expected("task.name", got, f"one of {', '.join(TASKS)}")
+    remedy = "Name it on the command line with task.file=FILE, or run it before."
+    want = f"a script that has registered {got}"
+    raise QPError.expected("task.file", f"{file!r}, which has not run", want, remedy)
