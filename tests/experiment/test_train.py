@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
@@ -22,7 +23,6 @@ from tests.runs import CONFIGS, SMALL, make_config, run_command
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass
-from torch_qpmpc.envs.point_mass import PointMassGymEnv
 from torch_qpmpc.experiment.launch import LOCK, locked
 from torch_qpmpc.experiment.run_folder import load_checkpoint, read_metrics
 from torch_qpmpc.mpc.layout import Layout, band_distance
@@ -266,11 +266,46 @@ SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task
 SHORT += ("rivals=false",)
 
 
+class Mass(gymnasium.Env):
+    """The point mass in Gymnasium, which raises, or has rewards of NaN, in a share of its steps."""
+
+    observation_space = Box(-10, 10, (4,))
+    action_space = Box(-1, 1, (2,))
+
+    def __init__(self, share: float = 0.0, raises: bool = False, after: int = 0) -> None:
+        self.share, self.raises, self.after, self.k = share, raises, after, 0
+        self.physics = PointMass()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = self.physics.starts(self.np_random, 1)[0]
+        return self.s.float().numpy(), {}
+
+    def step(self, action):
+        a = torch.as_tensor(action)
+        reward = -self.physics.cost(self.s, a).item()
+        nu = self.physics.noise(0 * self.s, self.physics.draw(self.np_random, 1)[0])
+        self.s = self.physics.step(self.s, a, nu)
+        self.k += 1
+        if self.k > self.after and self.np_random.random() < self.share:
+            if self.raises:
+                raise ArithmeticError("the integrator failed")
+            reward = float("nan")
+        return self.s.float().numpy(), reward, False, False, {}
+
+
+@pytest.fixture
+def mass(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = EnvSpec("Mass-v0", lambda **options: Mass(**options), max_episode_steps=50)
+    monkeypatch.setitem(gymnasium.registry, "Mass-v0", spec)
+
+
+@pytest.mark.usefixtures("mass")
 def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     A, B, W = PointMass().A.tolist(), PointMass().B.tolist(), torch.eye(6).tolist()
     model = (f"task.A={A}", f"task.B={B}", f"task.stage_weight={W}")
-    id = "torch_qpmpc/PointMass-v0"
+    id = "Mass-v0"
     run_command("task=gymnasium", f"task.id={id}", *model, *SHORT, "figures=false", "gate=false")
     folder = Path(capsys.readouterr().out.splitlines()[-1])
     assert folder.parent == tmp_path / "runs" / "gymnasium" / id / "none-deviation"
@@ -278,24 +313,8 @@ def test_any_gymnasium_environment_is_a_task(tmp_path, monkeypatch, capsys):
     assert (summary["task"], summary["unsolved"]) == ("gymnasium", 0)
 
 
-class Faulty(PointMassGymEnv):
-    """A point mass that raises, or has rewards of NaN, in a share of its steps."""
-
-    def __init__(self, share: float, raises: bool, after: int = 0) -> None:
-        super().__init__()
-        self.share, self.raises, self.after, self.k = share, raises, after, 0
-
-    def step(self, action):
-        s, reward, *rest = super().step(action)
-        self.k += 1
-        if self.k > self.after and self.np_random.random() < self.share:
-            if self.raises:
-                raise ArithmeticError("the integrator failed")
-            reward = float("nan")
-        return s, reward, *rest
-
-
-@pytest.mark.filterwarnings("ignore:The plant ends", "ignore:.*rewards are NaN", "ignore:Two epi")
+@pytest.mark.filterwarnings("ignore:The plant ends", "ignore:.*rewards are NaN")
+@pytest.mark.usefixtures("mass")
 @pytest.mark.parametrize(
     ("start", "share", "raises", "after", "wrong"),
     [
@@ -310,14 +329,11 @@ def test_a_faulty_plant_is_reported(
 ):
     """An exception ends an episode, and rewards of NaN the command, after all is written."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(
-        gymnasium.registry, "Faulty-v0", EnvSpec("Faulty-v0", lambda **x: Faulty(**x))
-    )
     A, B, W = PointMass().A.tolist(), PointMass().B.tolist(), torch.eye(6).tolist()
     model = [f"task.A={A}", f"task.B={B}"] if start == "model" else ["start.transitions=200"]
     model += [f"task.stage_weight={W}", f"start={start}", "task.start_episodes=0"]
     options = f"task.kwargs={{share: {share}, raises: {raises}, after: {after}}}"
-    arguments = ("task=gymnasium", "task.id=Faulty-v0", options, *model, *SHORT, "figures=false")
+    arguments = ("task=gymnasium", "task.id=Mass-v0", options, *model, *SHORT, "figures=false")
     arguments += ("task.episode_steps=20", "hydra.run.dir=run")
     if raises and wrong is None:
         run_command(*arguments)

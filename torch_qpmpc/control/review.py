@@ -485,7 +485,7 @@ def _weights(law: Law, known: Array) -> Finding:
             ("dR", design.dR, du, design.plant.inputs),
         ):
             parts = (x * (x @ W)).sum(0)
-            costs |= {f"{name} of {of[i]}": parts[i] for i in np.flatnonzero(W.any(0))}
+            costs |= {f"{name} of {of[i]}": float(parts[i]) for i in np.flatnonzero(W.any(0))}
     whole = sum(costs.values()) or 1.0
     shares = {name: cost / whole for name, cost in sorted(costs.items(), key=lambda x: -x[1])}
     numbers = {f"share of {name} in the cost": share for name, share in shares.items()}
