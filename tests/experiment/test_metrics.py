@@ -13,7 +13,6 @@ from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.evaluation import Evaluation, closed_gap
 from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
-from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.mpc.layout import banded_matrix
@@ -45,19 +44,6 @@ def test_table():
     assert lines[1].split() == ["J", "100.0", "60.00", "50.00", "0.800"]
     assert lines[2].split() == ["J", "discounted", "95.00", "57.00", "47.50", "0.800"]
     assert lines[3:] == ["Mean cost of 2 episodes of at most 2 steps"]
-
-
-@pytest.mark.parametrize(
-    ("start", "learned", "worse"),
-    [
-        (100.0, 60.0, "The start costs more than zero action: 100.0 against 70.00."),
-        (10.0, math.nan, "The learned policy costs more than zero action: nan against 70.00."),
-        (70.0 + 1e-9, 60.0, "  zero action     70.00"),
-    ],
-)
-def test_the_table_names_what_costs_more_than_zero_action(start, learned, worse):
-    found = evaluation(start, learned, math.nan, **{ZERO_ACTION: 70.0})
-    assert table(found.summary()).splitlines()[-1] == worse
 
 
 def test_the_numbers_of_theta_are_logged_where_they_are_few():

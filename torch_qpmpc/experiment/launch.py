@@ -31,10 +31,8 @@ from torch_qpmpc.experiment.config import (
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, load_checkpoint, read_summary, unwritable
 from torch_qpmpc.experiment.run_state import (
     check_fresh,
-    check_own_folder,
     check_state,
     configured,
-    folder_of,
     resumed,
 )
 from torch_qpmpc.experiment.tasks import run_code
@@ -42,7 +40,7 @@ from torch_qpmpc.experiment.tasks import run_code
 #: The locked file of a run's folder.
 LOCK = ".lock"
 # For hydra.run.dir in configs/config.yaml: a resumed run keeps its folder.
-OmegaConf.register_new_resolver("folder_of", folder_of, replace=True)
+OmegaConf.register_new_resolver("folder_of", lambda old, new: str(Path(old or new)), replace=True)
 
 
 def settled(
@@ -67,8 +65,9 @@ def settled(
         state = stopped_run(folder, cfg)
     elif resume is None:
         check_fresh(folder)
-    else:
-        check_own_folder(resume, folder)
+    elif Path(resume).resolve() != Path(folder).resolve():
+        remedy = "A run resumes in its own folder: omit hydra.run.dir, or copy the folder first."
+        raise QPError.expected("folder", f"{folder} with resume={resume}", resume, remedy)
     return cfg, state, None
 
 

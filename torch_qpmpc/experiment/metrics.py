@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +25,6 @@ from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation, cost_text, gap_text
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
-from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
@@ -210,22 +208,4 @@ def table(summary: Mapping[str, Any]) -> str:
         lines += ["", f"The gate kept the start: {kept}, by at most {compared} transitions."]
     if raised := summary.get("raised"):
         lines += ["", f"The plant ended {raised} episodes by exceptions: {summary['first_raised']}"]
-    return "\n".join(lines + _worse_than_zero(summary))
-
-
-def _worse_than_zero(summary: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if zero action costs less than the start or the learned policy."""
-    zero = summary["rivals"].get(ZERO_ACTION, math.nan)
-    if math.isnan(zero):
-        return []
-    ends = {"start": summary["J_start"], "learned policy": summary["J_best"]}
-    worse = {
-        name: cost_text(J)
-        for name, J in ends.items()
-        if not (zero >= J or math.isclose(J, zero, rel_tol=1e-6))
-    }
-    if not worse:
-        return []
-    names, verb = " and the ".join(worse), "costs" if len(worse) == 1 else "cost"
-    costs = " and ".join(worse.values())
-    return ["", f"The {names} {verb} more than zero action: {costs} against {cost_text(zero)}."]
+    return "\n".join(lines)

@@ -21,11 +21,6 @@ from torch_qpmpc.mpc.module import QPMPC
 
 #: Starts whose paths are drawn.
 SHOWN = 6
-#: Colours of the rivals' lines, in their order.
-RIVAL_COLOURS = (
-    "0.2",
-    *map("tab:{}".format, ("orange", "purple", "brown", "pink", "olive", "cyan")),
-)
 
 
 def draw_positions(
@@ -98,12 +93,10 @@ def draw_learning(
 
 def draw_lines(axes: Axes, costs: Mapping[str, float]) -> None:
     """Draw costs that learning does not change as horizontal lines, each with its number."""
-    others = (name for name in costs if name not in COLOURS)
-    colours = COLOURS | dict(zip(others, RIVAL_COLOURS, strict=False))
-    for name, J in costs.items():
+    for i, (name, J) in enumerate(costs.items()):
         line = "--" if name in COLOURS else ":"
         label = f"{name}, {cost_text(J)}"
-        axes.axhline(J, color=colours.get(name), linestyle=line, label=label)
+        axes.axhline(J, color=COLOURS.get(name, f"C{4 + i}"), linestyle=line, label=label)
 
 
 def scale_costs(axes: Axes) -> None:

@@ -140,8 +140,7 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         text = file.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut off")
-        # Read as text first: pandas before 3.1 rounds numbers that it reads.
-        table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
+        table = pd.read_csv(io.StringIO(text), dtype=float, float_precision="round_trip")
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
         remedy = "Resume from a copy of the folder, or start a new run with hydra.run.dir=FOLDER."

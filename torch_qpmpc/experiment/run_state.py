@@ -114,8 +114,8 @@ def check_state(state: Any, cfg: DictConfig) -> None:
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
     """Load a stopped run's configuration and last state, or None before its first checkpoint.
 
-    ``path`` is the run's folder or one of its checkpoints. Beside it, the command line's
-    ``overrides`` may only name the code that the run needs, as in ``task.file=FILE``.
+    Beside the run's folder ``path``, the command line's ``overrides`` may only name the code that
+    the run needs, as in ``task.file=FILE``.
     """
     given = {key: text.strip("'\"") for key, _, text in (x.partition("=") for x in overrides)}
     cfg, state = _stopped(path)
@@ -137,27 +137,25 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
 
 def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
     """Load a stopped run's configuration and last state as data."""
-    if not isinstance(path, str | Path):
-        raise QPError.expected("resume", repr(path), "a path")
-    path, config = Path(path), configured(path)
-    checkpoint = path / CHECKPOINT if path.is_dir() else path
-    if checkpoint.with_name("summary.json").exists():
+    config, path = configured(path), Path(path)
+    if (path / "summary.json").exists():
         raise QPError.expected("resume", f"{path}, which is finished", "a stopped run")
     cfg = load_config(config)
-    if path.is_dir() and not checkpoint.exists():
+    if not (path / CHECKPOINT).exists():
         return cfg, None
-    state = load_checkpoint(checkpoint)
+    state = load_checkpoint(path / CHECKPOINT)
     check_state(state, cfg)
     return cfg, state
 
 
 def configured(path: str | Path) -> Path:
-    """Return config.yaml of the run in ``path``, its folder or one of its checkpoints."""
-    config = Path(folder_of(str(path), "")) / "config.yaml"
-    if not Path(path).exists():
-        raise QPError.expected("resume", f"{path}, which does not exist", "a run's folder")
+    """Return config.yaml of the run in the folder ``path``."""
+    if not isinstance(path, str | Path):
+        raise QPError.expected("resume", repr(path), "a path")
+    config = Path(path) / "config.yaml"
     if not config.exists():
-        raise QPError.expected("resume", f"{path}, without config.yaml", "a run's folder")
+        wrong = "without config.yaml" if Path(path).exists() else "which does not exist"
+        raise QPError.expected("resume", f"{path}, {wrong}", "a run's folder")
     return config
 
 
@@ -177,21 +175,6 @@ def check_fresh(folder: str | Path) -> None:
     else:
         return
     raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)
-
-
-def check_own_folder(path: str | Path, folder: str | Path) -> None:
-    """Raise `QPError` unless ``folder`` is the one of the run resumed from ``path``."""
-    own = Path(folder_of(str(path), ""))
-    if own.resolve() != Path(folder).resolve():
-        remedy = "A run resumes in its own folder: omit hydra.run.dir, or copy the folder first."
-        raise QPError.expected("folder", f"{folder} with resume={path}", f"{own}", remedy)
-
-
-def folder_of(resume: str | None, fresh: str) -> str:
-    """Return the run's folder: the resumed run's, or ``fresh`` for a new run."""
-    if resume is None:
-        return str(Path(fresh))
-    return str(Path(resume) if Path(resume).is_dir() else Path(resume).parent)
 
 
 def _collector_state(collector: Collector) -> dict[str, Any] | None:

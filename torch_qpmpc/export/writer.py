@@ -8,7 +8,8 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from typing import NamedTuple
+from textwrap import fill
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -217,19 +218,10 @@ def array(name: str, x: Array, dtype: str) -> str:
         x = np.zeros([max(n, 1) for n in x.shape])
     shape = "".join(f"[{n}]" for n in x.shape)
     rows = x if x.ndim == 2 else x[None]
-    body = ",\n".join(_braced(numbers(row, dtype)) for row in rows)
+    edges: Any = {"initial_indent": "{", "subsequent_indent": " ", "break_on_hyphens": False}
+    body = "},\n".join(fill(", ".join(numbers(row, dtype)), WIDTH, **edges) for row in rows) + "}"
     body = f"{{\n{body}}}" if x.ndim == 2 else body
     return f"static const real {name}{shape} =\n{body};"
-
-
-def _braced(words: list[str]) -> str:
-    lines, line = [], "{"
-    for word in words:
-        if len(line) + len(word) + 2 > WIDTH:
-            lines.append(line.rstrip())
-            line = " "
-        line += f"{word}, "
-    return "\n".join([*lines, line.rstrip(", ") + "}"])
 
 
 def numbers(x: Array, dtype: str) -> list[str]:
