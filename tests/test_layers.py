@@ -57,17 +57,17 @@ LAYERS = {
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
-    ".": 394,
-    "analysis": 1027,
-    "control": 4502,
-    "envs": 1445,
-    "experiment": 3320,
-    "export": 1444,
+    ".": 380,
+    "analysis": 866,
+    "control": 4320,
+    "envs": 1355,
+    "experiment": 3148,
+    "export": 1238,
     "learning": 2798,
     "mpc": 5111,
     "proofs": 999,
     "qp": 5663,
-    "study": 547,
+    "study": 548,
 }
 #: Libraries that only some layers may import.
 RESERVED = {

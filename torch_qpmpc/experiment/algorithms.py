@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -123,9 +122,12 @@ def closed_loop_update(
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Any]:
         entropy = np.random.SeedSequence([seed, scheduler.last_epoch])
         descent.start(int(entropy.generate_state(1)[0]))
-        penalty: Callable[[QPMPC], Tensor] | None = None
-        if si is not None and windows is not None:
-            penalty = partial(_si_penalty, si, windows)
+
+        def penalty(mpc: QPMPC) -> Tensor:
+            if si is None or windows is None:
+                return torch.zeros(())
+            return si(mpc.C, windows, mpc.b.detach())
+
         cost = descent.update(penalty)
         if deviation is not None:
             share = float(scheduler.get_last_lr()[0] / scheduler.base_lrs[0])
@@ -133,10 +135,6 @@ def closed_loop_update(
         return {"loss/closed_loop": cost}, {}
 
     return update
-
-
-def _si_penalty(si: SystemIdentificationPenalty, windows: Tensor, mpc: QPMPC) -> Tensor:
-    return si(mpc.C, windows, mpc.b.detach())
 
 
 def make_penalties(

@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from torchrl.record.loggers import Logger, get_logger
 
@@ -170,29 +169,10 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-class WritableFolder(Callback):
-    """Creates and checks the folder of a run or a sweep; on failure, exits with one sentence."""
-
-    def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        self._make("hydra.run.dir", config)
-
-    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        self._make("hydra.sweep.dir", config)
-
-    @staticmethod
-    def _make(key: str, config: DictConfig) -> None:
-        folder = OmegaConf.select(config, key)
-        try:
-            Path(folder).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            # Hydra turns a callback's errors into warnings, but not SystemExit.
-            raise SystemExit(str(unwritable(folder, error, key))) from None
-
-
-def unwritable(folder: str | Path, error: OSError, key: str = "hydra.run.dir") -> QPError:
-    """Make the error of a run in ``folder``, set by ``key``, that ended with ``error``."""
+def unwritable(folder: str | Path, error: OSError) -> QPError:
+    """Make the error of a run in ``folder`` that ended with ``error``."""
     checkpoint = Path(folder) / CHECKPOINT
-    remedy = f"Choose another folder with {key}=FOLDER."
+    remedy = "Choose another folder with hydra.run.dir=FOLDER."
     if checkpoint.exists():
         remedy = f"{checkpoint} is intact: free space, then {COMMAND} resume={folder}."
     got = f"{folder}, where writing failed ({error})"

@@ -155,8 +155,9 @@ def make_tables(mpc: QPMPC) -> Tables:
     bounds = lb, ub, w
     rows = _rows(G[on_plan] @ Z, G[on_plan] @ z_0, unit, *(x[on_plan] for x in bounds))
     others = np.flatnonzero(bounded & ~enters)
-    known = _known(G[others] @ T_p, G[others] @ z_b, *(x[others] for x in bounds))
-    known = _with(known, _implied(C, T_p, z_b, b))
+    known = _rows(G[others] @ T_p, G[others] @ z_b, 1.0, *(x[others] for x in bounds))
+    pairs = zip(known.parts(), _implied(C, T_p, z_b, b).parts(), strict=True)
+    known = Rows(*map(np.concatenate, pairs))
     u = slice(n_p, n_p + n_u)
     u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
     of_u, own = units[u], H.diagonal()[:n_p]
@@ -211,15 +212,12 @@ def _solve(factor: Array, right: Array) -> Array:
     return np.linalg.solve(factor.T, np.linalg.solve(factor, right))
 
 
-def _rows(Y: Array, y_0: Array, unit: Array, lb: Array, ub: Array, w: Array) -> Rows:
+def _rows(Y: Array, y_0: Array, unit: Array | float, lb: Array, ub: Array, w: Array) -> Rows:
+    unit = np.broadcast_to(unit, y_0.shape)
     upper = np.maximum(lb, ub)  # bounds that cross by rounding are equal
     near = np.minimum(*(np.where(np.isfinite(x), np.abs(x), np.inf) for x in (lb, upper)))
     size = (np.abs(y_0) + near) / unit
     return Rows(Y / unit[:, None], (lb - y_0) / unit, (upper - y_0) / unit, w * unit, size, unit)
-
-
-def _known(Y: Array, y_0: Array, lb: Array, ub: Array, w: Array) -> Rows:
-    return _rows(Y, y_0, np.ones(len(Y)), lb, ub, w)
 
 
 def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
@@ -231,11 +229,7 @@ def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
     size = np.abs(C).sum(-1) * (np.abs(T_p).sum(-1) + np.abs(z_b)).max() + np.abs(b)
     remain = np.maximum(np.abs(Y).max(-1, initial=0), np.abs(y_0 - b)) > 1e-9 * size
     b, hard = b[remain], np.full(remain.sum(), np.inf)
-    return _known(Y[remain], y_0[remain], b, b, hard)
-
-
-def _with(rows: Rows, more: Rows) -> Rows:
-    return Rows(*(np.concatenate(pair) for pair in zip(rows.parts(), more.parts(), strict=True)))
+    return _rows(Y[remain], y_0[remain], 1.0, b, b, hard)
 
 
 def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[Array, Array]:
