@@ -193,7 +193,7 @@ def _solve_active(
     regular = size < 0
     for _ in range(PASSES):
         free = multiply(to_g.mT, group, of_v)
-        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows], 0.0)
+        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows], passes=1)
         dv = vy[:, : v.shape[-1]]
         v, t = v + dv, t.index_add(1, rows, dt)
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)

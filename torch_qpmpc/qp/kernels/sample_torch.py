@@ -287,13 +287,19 @@ def _solve(qps, sensitivities, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return vy[:, :d], lam + change, vy[:, d:]
 
 
-def hold(to_lam, group, vy, held, level, slip) -> tuple[Tensor, Tensor]:
+def hold(
+    to_lam, group, vy, held, level, slip: float = 0.0, passes: int = MAX_PASSES
+) -> tuple[Tensor, Tensor]:
+    """Return v and y with the ``held`` rows at their levels, and their multipliers.
+
+    Each pass refines the last one, until y is within ``slip`` of the levels.
+    """
     d, t = vy.shape[-1] - held.shape[-1], torch.zeros_like(level)
     order, real = _order(held)
     factor = _factor_held(to_lam[:, :, d:], group, order, real)
     order = order * real
     level = level.gather(1, order)
-    for _ in range(MAX_PASSES):
+    for _ in range(passes):
         short = (vy[:, d:].gather(1, order) - level).masked_fill_(~real, 0)
         if not (short.abs() > slip * (1 + level.abs())).any():
             break
