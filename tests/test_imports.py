@@ -6,21 +6,13 @@ import importlib.util
 import subprocess
 import sys
 
+import gymnasium
 import pytest
 
 import torch_qpmpc
 
 #: Each takes from a third of a second up to as long as torch itself, and no QP needs it.
-HEAVY = (
-    "gymnasium",
-    "tensordict",
-    "torchrl",
-    "torch._dynamo",
-    "ray",
-    "scipy.optimize",
-    "matplotlib",
-    "hydra",
-)
+HEAVY = ("tensordict", "torchrl", "torch._dynamo", "ray", "scipy.optimize", "matplotlib", "hydra")
 
 
 def loaded_after(code: str) -> set[str]:
@@ -30,10 +22,11 @@ def loaded_after(code: str) -> set[str]:
     return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
 
 
-def test_a_qp_and_a_controller_import_nothing_heavy():
+def test_a_qp_a_controller_and_the_ids_import_nothing_heavy():
     code = (
-        "import torch, torch_qpmpc\n"
+        "import gymnasium, torch, torch_qpmpc\n"
         "from torch_qpmpc import QPMPC, solve_qp\n"
+        "gymnasium.spec('torch_qpmpc/PointMass-v0')\n"
         "QPMPC.of(2, 1, 3).value(torch.ones(2))\n"
         "mpc = torch_qpmpc.LinearMPC(([[0.9]], [[0.5]]), 3, Q=1.0)\n"
         "torch_qpmpc.Controller(mpc).step([0.0], [1.0])"
@@ -51,3 +44,8 @@ def test_every_public_name_is_there_and_listed():
         assert value is vars(torch_qpmpc)[name], f"{name} is looked up twice"
     with pytest.raises(AttributeError, match="'torch_qpmpc' has no attribute 'QPMCP'"):
         torch_qpmpc.QPMCP  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue] - misspelt
+
+
+def test_gymnasium_has_the_ids():
+    registered = [name for name in gymnasium.registry if name.startswith("torch_qpmpc/")]
+    assert registered == [f"torch_qpmpc/{name}-v0" for name in ("PointMass", "GrosZanonLTI")]

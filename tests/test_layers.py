@@ -57,16 +57,16 @@ LAYERS = {
 }
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
-    ".": 380,
+    ".": 394,
     "analysis": 866,
     "control": 4320,
-    "envs": 1355,
-    "experiment": 3148,
+    "envs": 1428,
+    "experiment": 3149,
     "export": 1238,
     "learning": 2798,
     "mpc": 5111,
     "proofs": 999,
-    "qp": 5663,
+    "qp": 5669,
     "study": 548,
 }
 #: Libraries that only some layers may import.

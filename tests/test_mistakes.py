@@ -30,7 +30,7 @@ from torch_qpmpc.analysis.structure import (
     one_step_error,
     prediction_form,
 )
-from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv
+from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
 from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay
@@ -52,7 +52,8 @@ deviation, si = qm.DeviationPenalty(mpc.C_0, 2, 1), qm.SystemIdentificationPenal
 form = prediction_form(banded_matrix(A2, B1, 4), 2, 1)
 pair = prediction_form(torch.stack([mpc.C_0] * 2), 2, 1)
 model, pm = nearest_model(form), PointMass()
-pendulum = GymnasiumPlant("Pendulum-v1")
+pendulum, episode = GymnasiumPlant("Pendulum-v1"), PointMassGymEnv()
+episode.reset(seed=0)
 R = partial(Replay, 64, 2, 4, 3, 2)
 Loss, Newton = partial(qm.QPQLearningLoss, op), partial(qm.GaussNewton, mpc)
 LTI = partial(qm.QPMPC.from_model, A2, B1)
@@ -235,6 +236,9 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("a: got shape (5, 1), expected shape (*batch, 2).", lambda: pm.applied(zeros(5, 1))),
     ("rng: got 1, expected a NumPy or torch generator. From a seed:", lambda: pm.starts(1, 3)),
     ("nu: got shape (5, 1), expected", lambda: pm.step(zeros(5, 4), zeros(5, 2), zeros(5, 1))),
+    ("action: got 'a', expected finite numbers of shape (2,). Pass one", lambda: episode.step("a")),
+    ("action: got array([nan, nan]), expected finite", lambda: episode.step(np.full(2, np.nan))),
+    ("action: got array([[0., 0.]]), expected finite", lambda: episode.step(np.zeros((1, 2)))),
     ("num_envs: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(0, 5, 1)),
     ("task.id: got NoneType, expected a str.", lambda: GymnasiumPlant(None)),
     ("max_steps: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(1, 0, 1)),

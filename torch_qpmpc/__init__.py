@@ -3,6 +3,8 @@
 import pkgutil
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
+
 from torch_qpmpc.errors import QPError, SolverError
 
 if TYPE_CHECKING:
@@ -101,3 +103,15 @@ if not TYPE_CHECKING:
 
     def __dir__() -> list[str]:
         return sorted(globals().keys() | _LAZY)
+
+
+#: Module and length of an episode of each environment.
+_ENVIRONMENTS = {"PointMass": ("point_mass", 50), "GrosZanonLTI": ("gros_zanon", 5000)}
+for _name, (_module, _steps) in _ENVIRONMENTS.items():
+    # Registering an id twice warns, and a reload or a spawned worker imports this again.
+    if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
+        gymnasium.register(
+            id=f"torch_qpmpc/{_name}-v0",
+            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
+            max_episode_steps=_steps,
+        )

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import warnings
 from dataclasses import fields
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 from torch import Tensor
 
+import torch_qpmpc.envs
 from tests.rollouts import Staggered, collected, network_policy
 from torch_qpmpc.envs import (
     GrosZanonLTI,
     LinearSystem,
     LinearSystemEnv,
+    LinearSystemGymEnv,
     PointMass,
 )
 
@@ -22,6 +28,7 @@ PLANTS = {
     "brownian": PointMass("brownian", noise_std=0.1),
     "gros_zanon": GrosZanonLTI(),
 }
+IDS = ["torch_qpmpc/PointMass-v0", "torch_qpmpc/GrosZanonLTI-v0"]
 
 
 @pytest.fixture(params=PLANTS)
@@ -75,6 +82,47 @@ def test_moving_keeps_every_field(plant):
             assert (after.device.type, after.dtype) == ("meta", torch.float64)
         else:
             assert after == before
+
+
+# --- Gymnasium ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasium_finds_nothing_to_complain_about(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # With soft bounds the observation space is unbounded, about which Gymnasium warns.
+        warnings.filterwarnings("ignore", ".*(minimum|maximum) value is -?infinity")
+        check_env(gymnasium.make(name).unwrapped)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_importing_again_does_not_register_again(name):
+    spec = gymnasium.registry[name]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        importlib.reload(torch_qpmpc.envs)
+    assert gymnasium.registry[name] is spec
+
+
+def test_gymnasium_environment_follows_the_physics(plant):
+    env = gymnasium.wrappers.TimeLimit(LinearSystemGymEnv(plant), 50)
+    rng, actions = np.random.default_rng(7), np.random.default_rng(8)
+    observation, _ = env.reset(seed=7)
+    s, ends = plant.starts(rng, 1)[0], []
+    nu = torch.zeros_like(s)
+    np.testing.assert_array_equal(observation, s.float().numpy())
+    for _ in range(50):
+        action = actions.uniform(-1, 1, plant.B.shape[1]).astype(np.float32)
+        a = torch.as_tensor(action)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        assert reward == -plant.cost(s, a).item()
+        nu = plant.noise(nu, plant.draw(rng, 1)[0])
+        s = plant.step(s, a, nu)
+        np.testing.assert_array_equal(observation, s.float().numpy())
+        assert not terminated
+        ends.append(truncated)
+    assert ends == [False] * 49 + [True]
 
 
 # --- TorchRL -----------------------------------------------------------------------------------

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
 
-from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.envs import PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
-# The state after three steps without an action, from seed 0, by TorchRL's environment and the
-# evaluation. Another random stream would make old runs incomparable.
+# The state after three steps without an action, from seed 0, by TorchRL's environment, Gymnasium's,
+# and the evaluation. Another random stream would make old runs incomparable.
 STREAMS = {
     "gaussian": (
         [
             [1.386189124241971, 0.7486546355191386, -0.05537488976231461, 0.28670656064945294],
             [0.3418075824365586, 0.8524880912771976, -0.2293280592587446, -0.11370024203937927],
         ],
+        [0.2526988685131073, -0.8310462832450867, -0.3421364724636078, -0.35173073410987854],
         [
             [0.491563465475065, -0.5925391578324675, 0.21959516356427516, 0.30139892283057174],
             [-1.3803264710642795, -1.3755846539907206, 0.05156266796475741, 0.16244346226635692],
@@ -30,6 +32,7 @@ STREAMS = {
             [1.3924302589174424, 0.7388859620466084, -0.038814050528084176, 0.3003948846637864],
             [0.34384107478641024, 0.844312654601799, -0.23549338263857872, -0.1075581195169474],
         ],
+        [0.2764415442943573, -0.8244329690933228, -0.3324228823184967, -0.34862565994262695],
         [
             [0.4909096167236723, -0.5872203303804477, 0.2250730543295603, 0.30324090269488657],
             [-1.364416575193558, -1.383984444293915, 0.06643766707383592, 0.1642514910114522],
@@ -106,14 +109,29 @@ def test_starts_fill_their_range():
     assert (PointMass().starts(np.random.default_rng(0), 4000).abs().amax(0) > 0.99 * limits).all()
 
 
+def test_gymnasium_random_walk_restarts_with_the_episode():
+    env = PointMassGymEnv(PointMass("brownian", noise_std=1.0))
+    first, _ = env.reset(seed=1)
+    one = env.step(np.zeros(2, dtype=np.float32))[0]
+    again, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(env.step(np.zeros(2, dtype=np.float32))[0], one)
+
+
 @pytest.mark.parametrize("kind", STREAMS)
 def test_random_streams_stay_as_they_were(kind):
     p, nothing = PointMass(kind), torch.zeros(2, 2, dtype=torch.float64)
-    torchrl, evaluation = STREAMS[kind]
+    torchrl, gym, evaluation = STREAMS[kind]
 
     env = PointMassEnv(2, p, dtype=torch.float64, seed=0)
     data = env.rollout(3, policy=lambda td: td.set("action", nothing))
     np.testing.assert_allclose(data["next", "observation"][:, -1], torchrl, atol=1e-12)
+
+    one, observation = PointMassGymEnv(p), np.empty(4)
+    one.reset(seed=0)
+    for _ in range(3):
+        observation, *_ = one.step(np.zeros(2, dtype=np.float32))
+    np.testing.assert_allclose(observation, gym, atol=1e-6)
 
     run = closed_loop(lambda s: nothing, p, steps=3, starts=2, seed=0)
     np.testing.assert_allclose(run.states[-1], evaluation, atol=1e-12)
@@ -136,11 +154,17 @@ def test_the_true_model_has_no_offset():
 
 
 def test_environments_are_of_fifty_steps_with_the_papers_bounds():
+    one = gymnasium.make("torch_qpmpc/PointMass-v0")
+    assert one.spec is not None
+    assert one.spec.max_episode_steps == 50
     bound = np.array([2, 2, 10, 10], dtype=np.float32)
+    assert one.observation_space == gymnasium.spaces.Box(-bound, bound)
     env = PointMassEnv()
     assert (env.batch_size, env.max_steps) == ((8,), 50)
     far = env.reset()
     far["observation"] += 2 * torch.as_tensor(bound)
     assert not env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
-    assert isinstance(env.physics, PointMass)
-    assert env.physics.std == 0.01
+    for environment in (env, one.unwrapped):
+        assert isinstance(environment, PointMassEnv | PointMassGymEnv)
+        assert isinstance(environment.physics, PointMass)
+        assert environment.physics.std == 0.01

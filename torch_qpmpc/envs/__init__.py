@@ -1,22 +1,25 @@
-"""Plants, and their TorchRL environments."""
+"""Plants and environments; Gymnasium has them as ``torch_qpmpc/PointMass-v0`` and the like."""
 
 from __future__ import annotations
 
-from torch_qpmpc.envs.gros_zanon import GrosZanonLTI
+from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIGymEnv
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
-from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv
+from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.plant import Plant, PlantEnv
-from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv
+from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
 
 __all__ = [
     "GrosZanonLTI",
+    "GrosZanonLTIGymEnv",
     "GymnasiumPlant",
     "KalmanFilter",
     "LinearSystem",
     "LinearSystemEnv",
+    "LinearSystemGymEnv",
     "Plant",
     "PlantEnv",
     "PointMass",
     "PointMassEnv",
+    "PointMassGymEnv",
 ]

@@ -1,4 +1,4 @@
-"""Gros and Zanon's linear system.
+"""Gros and Zanon's linear system, with its Gymnasium environment.
 
     s+ = A s + B a + [e, 0],    e uniform in (-0.1, 0),    s_0 = [0, 0.15]
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_number, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
+    LinearSystemGymEnv,
     Rng,
     float64,
     uniform,
@@ -86,3 +87,10 @@ class GrosZanonLTI(LinearSystem):
         """Return the model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
         as_A = self.A.new_tensor
         return as_A([[1, 0.25], [0, 1]]), as_A([[0.0312], [0.25]])
+
+
+class GrosZanonLTIGymEnv(LinearSystemGymEnv):
+    """``torch_qpmpc/GrosZanonLTI-v0``, which never terminates and is truncated at 5000 steps."""
+
+    def __init__(self, physics: GrosZanonLTI | None = None) -> None:
+        super().__init__(GrosZanonLTI() if physics is None else physics)

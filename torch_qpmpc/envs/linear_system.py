@@ -1,4 +1,4 @@
-"""Linear systems s+ = A s + B a + nu, with their TorchRL environment.
+"""Linear systems s+ = A s + B a + nu, with their Gymnasium and TorchRL environments.
 
 A concrete plant defines the cost L, the noise nu and the starts. Rewards are -L(s, a).
 """
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
+import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,7 +20,8 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 
-#: A random generator: torch's in the TorchRL environments, numpy's in the evaluation.
+#: A random generator: torch's in the TorchRL environments, numpy's in the Gymnasium environments
+#: and in the evaluation.
 Rng = np.random.Generator | torch.Generator
 
 
@@ -180,6 +182,58 @@ class LinearSystem(ABC):
         ``seed`` seeds starts and noise.
         """
         return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
+
+
+def checked_action(action: Any, space: gymnasium.Space) -> Tensor:
+    """Return ``action`` in float64; raise `QPError` unless it is finite and fits ``space``."""
+    try:
+        a = torch.as_tensor(np.asarray(action, dtype=np.float64))
+    except (TypeError, ValueError):
+        a = torch.tensor(torch.nan)
+    if a.shape != space.shape or not a.isfinite().all():
+        expected, remedy = f"finite numbers of shape {space.shape}", "Pass one action, not a batch."
+        raise QPError.expected("action", repr(action), expected, remedy)
+    return a
+
+
+class LinearSystemGymEnv(gymnasium.Env):
+    """A Gymnasium environment of ``physics``, truncated by its registration, never terminated.
+
+    Raises:
+        QPError: if ``physics`` is no `LinearSystem`.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
+
+    def __init__(self, physics: LinearSystem) -> None:
+        check_kind("physics", physics, LinearSystem)
+        self.physics = p = physics
+        lb_s, ub_s, lb_a, ub_a = (b.float().numpy() for b in (p.lb_s, p.ub_s, p.lb_a, p.ub_a))
+        low, high = (lb_s, ub_s) if p.clips_states else (-np.inf, np.inf)
+        self.observation_space = gymnasium.spaces.Box(low, high, lb_s.shape)
+        self.action_space = gymnasium.spaces.Box(lb_a, ub_a)
+        self._s = self._nu = torch.zeros_like(p.lb_s)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; return its observation, float32 ``(n_x,)``, and no information."""
+        super().reset(seed=seed)
+        self._s = self.physics.starts(self.np_random, 1)[0]
+        self._nu = torch.zeros_like(self._s)
+        return self._s.numpy().astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply ``action`` ``(n_u,)``, clipped; return the observation, the reward and the flags.
+
+        Raises:
+            QPError: the action does not fit or is not finite.
+        """
+        a = checked_action(action, self.action_space)
+        reward = -self.physics.cost(self._s, a).item()
+        self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
+        self._s = self.physics.step(self._s, a, self._nu)
+        return self._s.numpy().astype(np.float32), reward, False, False, {}
 
 
 class LinearSystemEnv(VectorisedEnv):

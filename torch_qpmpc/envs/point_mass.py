@@ -1,4 +1,4 @@
-"""The paper's point mass (section "Point-Mass"), with its TorchRL environment.
+"""The paper's point mass (section "Point-Mass"), with its Gymnasium and TorchRL environments.
 
 s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 """
@@ -17,6 +17,7 @@ from torch_qpmpc.checks import check_choice, check_number, check_seed, check_ten
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
+    LinearSystemGymEnv,
     Rng,
     check_rng,
     float64,
@@ -135,6 +136,13 @@ class PointMass(LinearSystem):
         theta = rng.uniform(0.5, 5, size=4)
         as_A = self.A.new_tensor
         return self.A + as_A(dA), self.B + as_A(dB), as_A(theta)
+
+
+class PointMassGymEnv(LinearSystemGymEnv):
+    """``torch_qpmpc/PointMass-v0``, which never terminates and is truncated at 50 steps."""
+
+    def __init__(self, physics: PointMass | None = None) -> None:
+        super().__init__(PointMass() if physics is None else physics)
 
 
 class PointMassEnv(LinearSystemEnv):

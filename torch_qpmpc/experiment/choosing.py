@@ -95,8 +95,8 @@ class Choice(NamedTuple):
     def read(cls, folder: Path) -> Self:
         """Read the table of a run; raise `QPError` if it is missing or damaged."""
         try:
-            options: Any = {"index_col": "start", "float_precision": "round_trip"}
-            choice = cls(pd.read_csv(folder / STARTS, **options))
+            exact = dict.fromkeys(("J", "error"), float)  # pandas before 3.1 rounds
+            choice = cls(pd.read_csv(folder / STARTS, index_col="start", converters=exact))
             _ = choice.name, choice.scheme
         except Exception as error:  # damaged files raise errors of any type
             want = "the table of starts that a run wrote"

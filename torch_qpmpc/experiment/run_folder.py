@@ -139,7 +139,8 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         text = file.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut off")
-        table = pd.read_csv(io.StringIO(text), dtype=float, float_precision="round_trip")
+        # Python parses numbers to the last digit; pandas before 3.1 does not.
+        table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
         remedy = "Resume from a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
