@@ -231,10 +231,12 @@ def controlgym_lqg(plant: str, crossed: bool = True) -> float:
     the regulator's weight has no products of states and actions, as a `LinearMPC` has none.
     """
     env = controlgym(plant)
-    whole = env.S
-    env.S = whole if crossed else np.zeros_like(whole)
-    lqg = import_module("controlgym.controllers").LQG(env)
-    env.S = whole
+    make = import_module("controlgym.controllers").LQG
+    if crossed:
+        lqg = make(env)
+    else:
+        whole, env.S = env.S, np.zeros_like(env.S)
+        lqg, env.S = make(env), whole
     A, B, C = env.A, env.B2, env.C
     if hasattr(env, "B1"):
         W, V = (env.noise_cov * x @ x.T for x in (env.B1, env.D21))
