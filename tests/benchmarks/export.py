@@ -69,6 +69,7 @@ def compiled(mpc: QPMPC, folder: Path) -> Callable[[np.ndarray, bool], Times]:
     """Return a function that times the exported C at p ``(steps, n_p)``, warm or cold."""
     export = export_c(mpc, folder, storage="fast")
     timed = library(folder, HERE / "timing.c", str(folder / "policy.c"))
+    assert export.state_bytes is not None  # there is a compiler
     state = np.zeros(export.state_bytes // 8 + 8)
 
     def run(p: np.ndarray, cold: bool) -> Times:
