@@ -62,7 +62,7 @@ BUDGET = {
     "control": 4320,
     "envs": 1428,
     "experiment": 3149,
-    "export": 1238,
+    "export": 1342,
     "learning": 2798,
     "mpc": 5111,
     "proofs": 999,

@@ -271,3 +271,16 @@ def test_a_loop_without_a_first_plan_is_refused(tmp_path):
     mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, R=0.1, **band)
     with pytest.raises(SolverError, match=r"^No input satisfies the hard bounds at rest: widen"):
         qm.Controller(mpc).export_c(tmp_path)
+
+
+def test_a_controller_whose_outputs_have_bounds_is_exported(tmp_path):
+    """An interior point's actions are off by 6e-6 here, at rows that are nearly active."""
+    model = [[0.9, 0.0], [0.2, 0.8]], [[0.25], [0.0]], [[0.0, 1.0]]
+    limits = {"y_bounds": (0.0, 30.0), "u_bounds": (0.0, 12.0)}
+    controller = qm.Controller(
+        qm.LinearMPC(model, 12, Q=1.0, dR=0.1, **limits), noise=0.05, drift=0.02
+    )
+    controller.reset(y=[10.0], u=[4.0])
+    difference = controller.export_c(tmp_path).difference
+    assert difference is not None
+    assert difference < 1e-10

@@ -1,15 +1,20 @@
-"""An exported policy beside the interior point: random states of every kind, and the differences.
+"""An exported policy beside an exact solver: random states of every kind, solutions, differences.
 
-Of the solvers it is the most accurate one: its actions are exact up to rounding.
+A certified solution gives the active set; for a fixed one, the KKT conditions of the whole plan are
+linear equations. Their solution, with iterative refinement, is exact up to rounding if it confirms
+the active set, and else corrects it. Where this does not settle, the interior point is the most
+accurate solver.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
 
 from torch_qpmpc.errors import QPError
@@ -17,12 +22,21 @@ from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import Array, Tables
 from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.program import QuadraticProgram, Status
+from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solve import solve_qp
 
 #: Number of random states that the compiled policy is compared at; at least `LEAST` for a `LARGE`
-#: QP, of more rows, whose cold solves take long.
-COMPARED, LEAST, LARGE = 400, 40, 200
+#: QP, whose cold solves take long.
+COMPARED, LEAST = 400, 40
+#: QPs of more rows are solved by the interior point alone.
+LARGE = 200
+#: Most steps from one active set to the next.
+MAX_STEPS = 20
+#: A correction is kept if the value changes by no more than this fraction.
+CERTIFIED = 1e-5
+#: Differences above this, relative to the largest action or value, are worth an exact solution.
+DOUBTFUL = 1e-9
 #: Examples of each kind.
 EACH = 3
 #: A centre that is nearer to a bound, relative to the distance of both, is at that bound.
@@ -72,11 +86,12 @@ class Reference(NamedTuple):
 
 
 @torch.no_grad()
-def reference(mpc: QPMPC, p: Array) -> Reference:
-    """Return the certified solutions of V at p ``(B, n_p)`` by the interior point."""
+def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> Reference:
+    """Return the certified solutions of V at p ``(B, n_p)`` by a solver of the package."""
     qp = mpc.quadratic_program()
+    solver = solver or ("torch" if _is_large(qp) else "daqp")
     fixed = torch.as_tensor(p, dtype=qp.q.dtype, device=qp.q.device)
-    solution = solve_qp(qp, fixed, solver="torch", on_failure="mask")
+    solution = solve_qp(qp, fixed, solver=solver, on_failure="mask")
     solved = (solution.status == Status.SOLVED).cpu().numpy()
     u = solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u].double().cpu().numpy()
     value = solution.value.double().cpu().numpy()
@@ -86,6 +101,93 @@ def reference(mpc: QPMPC, p: Array) -> Reference:
         np.where(solved, value, np.nan),
         solution.active.cpu().numpy().copy(),
     )
+
+
+def _is_large(qp: QuadraticProgram) -> bool:
+    """Return True for more than `LARGE` rows with a bound."""
+    return int((qp.lb.isfinite() | qp.ub.isfinite()).sum()) > LARGE
+
+
+def sharpen(mpc: QPMPC, p: Array, coarse: Reference, which: Array) -> Reference:
+    """Replace solutions of ``coarse`` at the indices ``which`` by exact ones."""
+    qp = mpc.quadratic_program()
+    if _is_large(qp):
+        return coarse
+    data = [x.detach().double().cpu().numpy() for x in qp.tensors()]
+    u, value = coarse.u.copy(), coarse.value.copy()
+    for i in which:
+        z = _exact(data, np.asarray(p[i], dtype=np.float64), coarse.active[i])
+        if z is None:
+            other = reference(mpc, p[i : i + 1], "torch")
+            if other.status[0] == Status.SOLVED:
+                u[i], value[i] = other.u[0], other.value[0]
+            continue
+        cost = _cost(data, z)
+        if abs(cost - value[i]) <= CERTIFIED * (1 + abs(value[i])):
+            u[i], value[i] = z[mpc.n_p : mpc.n_p + mpc.n_u], cost
+    return coarse._replace(u=u, value=value)
+
+
+def _exact(data: list[Array], p: Array, active: Array) -> Array | None:
+    """Return the z that the KKT conditions of an active set give, None if it does not settle."""
+    H, q, _, C, b, G, lb, ub, w = data
+    n_p, n_c = len(p), len(C)
+    n = H.shape[0] - n_p
+    held = (np.abs(active) == 1) | ((lb == ub) & (np.abs(active) < 2))
+    level = np.where(active > 0, ub, lb)
+    fixed = np.where(np.abs(active) == 2, np.sign(active) * np.where(np.isinf(w), 0, w), 0.0)
+    held &= np.abs(G[:, n_p:]).max(-1) > 0
+    previous = None
+    for _ in range(MAX_STEPS):
+        A = G[held, n_p:]
+        B = np.concatenate((C[:, n_p:], A))
+        kkt = np.block([[H[n_p:, n_p:], B.T], [B, np.zeros((len(B), len(B)))]])
+        right = np.concatenate(
+            (
+                -q[n_p:] - H[n_p:, :n_p] @ p - G[:, n_p:].T @ fixed,
+                b - C[:, :n_p] @ p,
+                level[held] - G[held, :n_p] @ p,
+            )
+        )
+        x = _solve(kkt, right)
+        z = np.concatenate((p, x[:n]))
+        lam = fixed.copy()
+        lam[held] = x[n + n_c :]
+        level, held, fixed = row_states(G @ z + lam, lb, ub, w)
+        held &= np.abs(G[:, n_p:]).max(-1) > 0
+        fixed = np.where(held, 0.0, fixed)
+        fixed[~(np.abs(G[:, n_p:]).max(-1) > 0)] = 0.0
+        states = held, np.where(held, level, 0), fixed
+        if previous is not None and all(map(np.array_equal, states, previous)):
+            return z
+        previous = states
+    return None
+
+
+def _solve(matrix: Array, right: Array) -> Array:
+    """Solve a linear system with two refinements, by least squares if it is singular."""
+    lu, pivots, _ = scipy.linalg.lapack.dgetrf(matrix)
+
+    def regular(right: Array) -> Array:
+        return scipy.linalg.lapack.dgetrs(lu, pivots, right)[0]
+
+    x, solve = regular(right), regular
+    with np.errstate(all="ignore"):  # of a singular matrix
+        error = np.abs(matrix @ x - right).max()
+    if not error <= 1e-8 * (1 + np.abs(right).max()):
+        inverse = np.linalg.pinv(matrix, rcond=1e-13, hermitian=True)
+        x, solve = inverse @ right, partial(np.matmul, inverse)
+    wide = matrix.astype(np.longdouble)
+    for _ in range(2):
+        x = x + solve((right - wide @ x).astype(np.float64))
+    return x
+
+
+def _cost(data: list[Array], z: Array) -> float:
+    H, q, c, _, _, G, lb, ub, w = data
+    z, y = z.astype(np.longdouble), G @ z
+    off = np.maximum(np.maximum(lb - y, y - ub), 0)
+    return float(z @ (H @ z) / 2 + q @ z + c + np.where(np.isinf(w), 0, w) @ off)
 
 
 def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
@@ -152,20 +254,22 @@ def nearer(
     return p, exact
 
 
-def choose(mpc: QPMPC, p: Array, exact: Reference) -> Examples:
-    """Choose a few states of each kind.
+def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
+    """Choose a few states of each kind, and return exact solutions of them.
 
     Raises:
         QPError: no state is solved.
     """
-    solved, states = exact.status == Status.SOLVED, np.abs(exact.active)
+    solved, states = coarse.status == Status.SOLVED, np.abs(coarse.active)
     kinds = {
         "interior": solved & (states == 0).all(-1),
         "at bounds": solved & (states == 1).any(-1) & (states != 2).all(-1),
         "saturated": solved & (states == 2).any(-1),
-        "infeasible": exact.status == Status.INFEASIBLE,
+        "infeasible": coarse.status == Status.INFEASIBLE,
     }
     chosen = {kind: np.flatnonzero(mask)[:EACH] for kind, mask in kinds.items()}
+    exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
+    codes = {"infeasible": 2}
     if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
         remedy = (
@@ -175,18 +279,11 @@ def choose(mpc: QPMPC, p: Array, exact: Reference) -> Examples:
     H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
     terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
     examples = [
-        Example(
-            kind,
-            p[i],
-            INFEASIBLE * (kind == "infeasible"),
-            exact.u[i],
-            float(exact.value[i]),
-            float(terms[i]),
-        )
+        Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]), float(terms[i]))
         for kind, indices in chosen.items()
         for i in indices
     ]
-    return Examples(examples, _size(exact.u, solved), float(_size(exact.value, solved)))
+    return Examples(examples, _size(exact.u, solved), float(_size(exact.value, solved))), exact
 
 
 def _size(x: Array, solved: Array) -> Array:
@@ -195,7 +292,7 @@ def _size(x: Array, solved: Array) -> Array:
 
 
 def compare(
-    tables: Tables, library: Library, p: Array, exact: Reference
+    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference
 ) -> tuple[Agreement, float]:
     """Return the agreement, and the largest error of an action relative to its size.
 
@@ -205,11 +302,18 @@ def compare(
     steps = library.steps(states, p, tables.n_u)
     solvable = exact.status == Status.SOLVED
     both = solvable & (steps.codes == 0)
-    u = np.abs(steps.u - exact.u).max(-1)
-    value = np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
+
+    def differences(exact: Reference) -> tuple[Array, Array]:
+        u = np.abs(steps.u - exact.u).max(-1)
+        return u, np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
+
+    u, value = differences(exact)
     # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
     sizes = np.abs(exact.u).max(-1)
     sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
+    doubtful = both & ((u > DOUBTFUL * sizes) | (value > DOUBTFUL))
+    if library.real == np.float64:
+        u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
     agreement = Agreement(
         states=len(p),
         solved=int(both.sum()),

@@ -144,14 +144,14 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
         max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST,
     )
     p, exact = states(mpc, tables, dtype)
-    examples = choose(mpc, p, exact)
+    examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings), examples)
     for file, text in texts.items():
         (folder / file).write_text(text, encoding="utf-8")
     library, agreement = None, None
     if compiler() is not None:
         library = Library(folder, name, dtype)
-        agreement, error = compare(tables, library, p, exact)
+        agreement, error = compare(mpc, tables, library, p, exact)
         solvable, unsolved = agreement.solved + agreement.unsolved, agreement.unsolved
         if limit is None and unsolved > UNSOLVED * solvable:
             _refuse(dtype, f"{unsolved} of {solvable} states not certified", tables)
