@@ -70,7 +70,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
         part = p[start : start + CHUNK]
         cold = library.steps(library.states(len(part)), part, mpc.n_u)
         again = [library.steps(warm, x[None], mpc.n_u) for x in part]
-        exact = reference(mpc, part)
+        exact = reference(mpc, part, "torch")
         for steps in (cold, type(cold)(*map(np.concatenate, zip(*again, strict=True)))):
             u, value = differences(steps, exact)
             solved = (steps.codes == 0) & (exact.status == Outcome.SOLVED)

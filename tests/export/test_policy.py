@@ -39,7 +39,7 @@ def check(mpc, folder, count=200, seed=0, **settings):
     cold = library.steps(library.states(count), p, tables.n_u)
     state = library.states(1)
     warm = [library.steps(state, p[i : i + 1], tables.n_u) for i in range(count)]
-    known = reference(mpc, p)
+    known = reference(mpc, p, "torch")
     codes = np.select([known.status == Status.SOLVED, known.status == 1], [SOLVED, INFEASIBLE], -1)
     np.testing.assert_array_equal(cold.codes, codes)
     np.testing.assert_array_equal([step.codes[0] for step in warm], codes)
@@ -122,7 +122,7 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
             break
     assert codes[0] == LIMIT
     assert codes[-1] == SOLVED
-    np.testing.assert_allclose(steps.u, reference(mpc, p).u, atol=1e-9)
+    np.testing.assert_allclose(steps.u, reference(mpc, p, "torch").u, atol=1e-9)
     export_c(mpc, tmp_path, max_iterations=3)  # its self-test leaves out states beyond the limit
 
 
@@ -133,7 +133,7 @@ def test_a_qp_without_rows_has_a_linear_policy(tmp_path):
     p = draw_known(mpc, 50)
     steps = library.steps(library.states(50), p, 1)
     assert not steps.codes.any()
-    np.testing.assert_allclose(steps.u, reference(mpc, p).u, atol=1e-9)
+    np.testing.assert_allclose(steps.u, reference(mpc, p, "torch").u, atol=1e-9)
 
 
 def built(command, folder, *flags):
