@@ -61,7 +61,7 @@ BUDGET = {
     "analysis": 866,
     "control": 4320,
     "envs": 1428,
-    "experiment": 3149,
+    "experiment": 3170,
     "export": 1342,
     "learning": 2798,
     "mpc": 5111,

@@ -128,6 +128,7 @@ def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, d
     same = code.keys() <= given.keys() and given.get("task.id") == code.get("task.id")
     if not (same or has_run(cfg.task)):
         words = ", ".join(f"{key}={value!r}" for key, value in code.items())
+        words += f" with task.kwargs={cfg.task.kwargs}" if cfg.task.get("kwargs") else ""
         got = f"{path}, whose config.yaml names code ({words})"
         command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
         remedy = f"Read that code, which may not be yours; to run it: {command}"

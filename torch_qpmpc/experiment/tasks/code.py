@@ -11,11 +11,12 @@ import re
 import runpy
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.tasks.registry import TASKS
@@ -38,12 +39,11 @@ def named_code(task: Mapping[str, Any]) -> dict[str, str]:
 
 
 def modules(task: Mapping[str, Any]) -> list[str]:
-    """Return the modules that a Gymnasium environment's id and arguments name, as ``module:Id``."""
+    """Return the importable modules that a Gymnasium environment's id and arguments name."""
     if task.get("name") != "gymnasium":
         return []
-    names = re.findall(r"([^\W\d][\w.]*):\w", f"{task.get('id')} {task.get('kwargs')}")
-    spec = importlib.util.find_spec  # which runs no code of a module without a dot
-    return [name for name in names if name in sys.modules or spec(name.partition(".")[0])]
+    names = [text.partition(":")[0] for text in _strings([task.get("id"), task.get("kwargs")])]
+    return [name for name in names if _is_module(name)]
 
 
 def has_run(task: Mapping[str, Any]) -> bool:
@@ -112,3 +112,23 @@ def resume_arguments(folder: str | Path, task: Mapping[str, Any]) -> str:
         plain = re.fullmatch(r"[\w./:-]+", value)
         words.append(f"{key}={value}" if plain else shlex.quote(f'{key}="{value}"'))
     return " ".join(words)
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, DictConfig | ListConfig):
+        value = OmegaConf.to_container(value, resolve=True)
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list | tuple):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _strings(item)
+
+
+def _is_module(name: str) -> bool:
+    """Return True if ``name`` could be imported; its code does not run."""
+    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*", name):
+        return False
+    try:
+        return importlib.util.find_spec(name.partition(".")[0]) is not None
+    except ValueError:  # __main__, as under pytest
+        return True
