@@ -93,6 +93,18 @@ def test_the_report_says_that_inputs_are_logged_a_row_late(late, unit):
     assert said is None or int(said[1]) > 50
 
 
+@pytest.mark.filterwarnings("error")
+def test_single_steps_are_not_said_to_be_late():
+    """Their inputs have no outputs of the same row that the model predicts."""
+    rng = np.random.default_rng(0)
+    logs = []
+    for y, u, e in rng.normal(size=(100, 3)):
+        logs.append({"y": np.array([y, 0.9 * y + 0.5 * u + 0.1 * e]), "u": np.array([u])})
+    text = str(qm.identify(logs, 1))
+    assert "Model of order 1" in text
+    assert "up a row" not in text
+
+
 def test_an_exact_log_is_not_said_to_be_late():
     u, y = np.random.default_rng(0).uniform(-1, 1, 50), np.zeros(51)
     for t in range(50):

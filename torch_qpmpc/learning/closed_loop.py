@@ -330,8 +330,8 @@ class _Loops:
             torch.autograd.grad(u.sum(), known, retain_graph=True)[0] for u in actions.unbind(-1)
         )
         gains = torch.stack([*rows], -2)
-        share, slope = torch.full_like(taken.costs[0], 1 / taken.costs.numel()), self._s * 0
-        slopes = torch.empty_like(taken.actions)
+        share = torch.full_like(taken.costs[0], 1 / taken.costs.numel())
+        slope, slopes = torch.zeros_like(self._s), torch.empty_like(taken.actions)
         for k in range(steps - 1, -1, -1):
             s, a = taken.states[k].requires_grad_(), taken.actions[k].requires_grad_()
             ends = self._plant.cost(s, a), self._plant.step(s, a, taken.noise[k])

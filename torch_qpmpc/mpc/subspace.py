@@ -169,19 +169,18 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
     The model predicts an output from the inputs of the rows before: a share above zero is feedback,
     or an input that is logged a row late.
     """
-    pairs, sizes = [], []
-    for (y, v), _ in _batches(_signals(trajectories)):
-        u, d = np.split(v, [model.B.shape[1]], -1)
-        rows = np.concatenate((model.errors(y, u, d, 1)[..., :-1, 0, :], u[..., 1:, :]), -1)
-        pairs.append(rows.reshape(-1, rows.shape[-1]))
-        sizes.append(np.nanmax(np.abs(y), (0, 1)))
-    rows = np.concatenate(pairs)
+    n_y, n_u = len(model.C), model.B.shape[1]
+    parts = zip(_errors(model, trajectories, 1), _batches(_signals(trajectories)), strict=True)
+    pairs = (np.concatenate((e[:, :-1, 0], v[:, 1:, :n_u]), -1) for e, ((_, v), _) in parts)
+    rows = np.concatenate([x.reshape(-1, n_y + n_u) for x in pairs])
     rows = rows[np.isfinite(rows).all(1)]
-    e, u = np.split(rows - rows.mean(0), [len(model.C)], 1)
+    if len(rows) <= n_u + 1:  # such as from trajectories of single steps
+        return np.zeros(n_y)
+    e, u = np.split(rows - rows.mean(0), [n_y], 1)
     left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
-    degrees = max(len(rows) - u.shape[1] - 1, 1)
-    before, after = (e**2).sum(0) / max(len(rows) - 1, 1), (left**2).sum(0) / degrees
-    noisy = before > (EXACT * np.max(sizes, 0)) ** 2
+    before, after = (e**2).sum(0) / (len(rows) - 1), (left**2).sum(0) / (len(rows) - n_u - 1)
+    size = np.nanmax(np.abs(np.concatenate([one.y.numpy() for one in trajectories])), 0)
+    noisy = before > (EXACT * size) ** 2
     return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
 
 
