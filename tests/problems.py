@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +38,19 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
     """Draw standard normal entries."""
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+@torch.no_grad()
+def central_difference(
+    function: Callable[[], Tensor], leaf: Tensor, direction: Tensor, step: float
+) -> Tensor:
+    """Return the slope of a function while ``leaf`` moves in place along a direction."""
+    ends = []
+    for sign in (1, -1):
+        leaf.add_(sign * step * direction)
+        ends.append(function())
+        leaf.sub_(sign * step * direction)
+    return (ends[0] - ends[1]) / (2 * step)
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
+from tests.problems import central_difference
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.closed_loop import _Loops, growth, simulated_plant, stage_cost
@@ -64,13 +65,7 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
             continue
         direction = torch.randn(leaf.shape, generator=torch.Generator().manual_seed(2)).double()
         direction = direction.tril() if name in ("H", "H_f") else direction
-        step, ends = 1e-6, []
-        with torch.no_grad():
-            for sign in (1, -1):
-                leaf.add_(sign * step * direction)
-                ends.append(cost())
-                leaf.sub_(sign * step * direction)
-        expected = (ends[0] - ends[1]) / (2 * step)
+        expected = central_difference(cost, leaf, direction, 1e-6)
         torch.testing.assert_close((leaf.grad * direction).sum(), expected, rtol=1e-4, atol=1e-7)
 
 

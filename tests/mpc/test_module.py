@@ -44,7 +44,7 @@ from tests.mpc.settings import (
     previewed,
     stepped,
 )
-from tests.problems import MIXED, normal, random_mpc, random_states, step
+from tests.problems import MIXED, central_difference, normal, random_mpc, random_states, step
 from torch_qpmpc import (
     QPMPC,
     GaussNewton,
@@ -161,13 +161,9 @@ def test_gradients_in_theta_and_p_agree_with_differences(name, function):
             if mpc.structure == "tied":
                 learned = learned[mpc.get_buffer(f"{leaf_name.removesuffix('original')}0.first")]
             direction = direction * learned
-        values = []
-        with torch.no_grad():
-            for sign in (1, -2):
-                leaf += sign * size * direction
-                values.append(FUNCTIONS[function](mpc, p, a).sum())
-            leaf += size * direction
-        difference = (values[0] - values[1]) / (2 * size)
+        difference = central_difference(
+            lambda: FUNCTIONS[function](mpc, p, a).sum(), leaf, direction, size
+        )
         found = torch.zeros(()) if leaf.grad is None else (leaf.grad * direction).nan_to_num().sum()
         assert_close(
             found.double(), difference, rtol=1e-4, atol=atol, msg=lambda m, x=leaf_name: f"{x} {m}"
