@@ -64,7 +64,7 @@ BUDGET = {
     "experiment": 3170,
     "export": 1342,
     "learning": 2798,
-    "mpc": 5111,
+    "mpc": 5110,
     "proofs": 999,
     "qp": 5669,
     "study": 548,
