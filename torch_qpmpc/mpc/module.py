@@ -68,7 +68,7 @@ class QPMPC(nn.Module):
     Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
     stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
     x_N, discounted by gamma^N. Parameters and buffers are float64, inputs of any float dtype;
-    outputs have the dtype of the input.
+    outputs have the input's dtype. H and H_f are the blocks; `quadratic_program` has the QP's H.
 
     Signals that are known ahead of time, such as prices, forecasts and references, are the
     *preview* d_0, .., d_N (``n_d`` entries each), z = [d_0, .., d_N, x_0,  u_0, x_1, .., x_N]. V
@@ -647,7 +647,7 @@ class QPMPC(nn.Module):
                 part.place(self.C_0.device)
 
     def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
-        """Return the fixed entries of z: s, or s and a side by side."""
+        """Return the fixed entries of z: s ``(*batch, n_p)``, or [s, a] ``(*batch, n_p + n_u)``."""
         if a is None:
             return check_tensor("s", s, self.n_p, device=self.C_0.device)
         return check_pair(s, a, self.n_p, self.n_u, self.C_0.device)

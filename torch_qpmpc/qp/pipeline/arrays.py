@@ -1,4 +1,4 @@
-"""Arrays of the pipeline: data, condensed QPs, candidates of backends, certified solutions.
+"""Arrays of the pipeline: data, reduced QPs, candidates of backends, certified solutions.
 
 They are NumPy's on the CPU, and tensors on other devices.
 """
@@ -21,7 +21,7 @@ Array = Any
 
 
 class Theta(NamedTuple):
-    """The data of B QPs over M distinct matrix triples, in float64.
+    """B QPs over M distinct matrix triples, in float64, in another order than `QuadraticProgram`.
 
     H ``(M, n_z, n_z)``, symmetric, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``, q ``(B, n_z)``, c
     ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``. A vector that the batch shares has one row.
@@ -102,7 +102,7 @@ class BackendSolution(NamedTuple):
 
 
 class BatchSolution(NamedTuple):
-    """Primal-dual solutions of B QPs, see `QPSolution`; lam = eta - upsilon."""
+    """Solutions of B QPs, see `QPSolution`; a candidate has status 0, and `accepted` judges it."""
 
     value: Array
     z: Array

@@ -1,4 +1,4 @@
-"""The backends, one per file, which solve condensed QPs (eq:qp2, eq:qp3).
+"""The backends, one per file, which solve reduced QPs (eq:qp2, eq:qp3).
 
 A backend is a function ``solve(qps: SoftQPs) -> BackendSolution``. To add one, write its file and
 list it in `BACKENDS`.

@@ -150,7 +150,7 @@ class BatchedQPs:
         return factor
 
     def residual(self, v: Tensor, lam: Tensor) -> Tensor:
-        """Return the certificate's relative KKT residual for the condensed QPs, ``(B,)``."""
+        """Return the certificate's relative KKT residual for the reduced QPs, ``(B,)``."""
         Hv, y, G_lam = self.apply_H(v), self.rows(v), self.apply_Gt(lam)
         stationarity = _largest(Hv + self.g + G_lam)
         stationarity /= 1 + _largest(torch.cat((Hv, self.g, G_lam), dim=-1))
