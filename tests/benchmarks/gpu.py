@@ -202,8 +202,8 @@ def report(device: torch.device) -> str:
     return "\n\n".join(
         (
             f"On one {card}, with torch {torch.__version__} and {os.cpu_count()} CPU cores.",
-            "**By batch**, in microseconds per QP. The memory is the peak of the first column; the "
-            "error is the largest of a value, compared with DAQP:",
+            "**By batch**, in microseconds per QP. Memory is the peak while V is computed; the "
+            "error is the largest of a value, against DAQP:",
             curve(device),
             "**Beside other solvers**, in microseconds per QP:",
             comparison(device),

@@ -216,10 +216,10 @@ def main(arguments: list[str] | None = None) -> int:
     packages = ("torch", "daqp", "osqp", "clarabel", "casadi")
     versions = ", ".join(f"{name} {version(name)}" for name in packages if find_spec(name))
     text = (
-        f"CPU milliseconds of a step: median / largest of the least of {PASSES} passes / largest, "
-        f"of {STEPS:,} steps (Clarabel, CasADi: {FEW}), with {versions}; one thread unless a row "
-        f"says default threads, here {default} on "
-        f"{os.cpu_count()} cores.\n\n{table(['', *columns], lines)}"
+        f"CPU milliseconds of a step: median / largest over steps of the fastest of {PASSES} "
+        f"passes / largest, over {STEPS:,} steps (Clarabel, CasADi: {FEW}), with {versions}; one "
+        f"thread unless a row says default threads, here {default} on {os.cpu_count()} cores."
+        f"\n\n{table(['', *columns], lines)}"
     )
     print(text)
     if options.write:

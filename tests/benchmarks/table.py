@@ -79,10 +79,10 @@ def gradients(rows: list[Row]) -> str:
     if not rows:
         return ""
     caption = (
-        "V on the next states, Q on the visited pairs, and the gradient in all of theta, in ms; in "
-        "brackets the speed-up over ProxSuite's layer, timed in turns with that row. On the right, "
-        "for a dense C, the largest relative errors: of a value, with how many are wrong by more "
-        "than 1e-6, and of the gradient."
+        "Each time, in ms, covers V on the next states, Q on the visited pairs, and the gradient "
+        "in all of theta; brackets have the speed-up over ProxSuite's layer, timed in turns. On "
+        "the right are the largest relative errors for a dense C: of values, with the number wrong "
+        "by more than 1e-6, and of gradients."
     )
     own = {_case(row): row["seconds"] for row in rows if row["row"] == REFERENCE}
     lines = []

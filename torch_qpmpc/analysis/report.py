@@ -99,7 +99,7 @@ def read(
     Args:
         mpc: the QP.
         true_model: the plant's A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, and, if it has them,
-            offset and E ``(n_x, n_d)``; None if they are unknown.
+            offset and E ``(n_x, n_d)``; None if unknown: `read` never looks them up.
         at: the state of the policy's gain, ``(n_p,)``; the origin by default.
 
     Raises:

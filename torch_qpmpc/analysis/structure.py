@@ -135,7 +135,7 @@ def predictions(mpc: QPMPC) -> PredictionForm:
 
 
 def canonical(mpc: QPMPC) -> Tensor:
-    """Return C ``(n_c, n_z)`` in the gauge in which an MPC scheme's is banded."""
+    """Return C ``(n_c, n_z)`` in the gauge that makes an MPC scheme's C banded."""
     form = predictions(mpc)
     return canonical_matrix(form, stage_models(form).A)[0]
 
@@ -143,8 +143,8 @@ def canonical(mpc: QPMPC) -> Tensor:
 def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
     """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
 
-    For an MPC scheme only the band remains, C_0; else a row's other entries are what x_k, u_k and
-    d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is
+    For an MPC scheme the result is the banded C_0; otherwise entries off the band are what x_k, u_k
+    and d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is
     C ``(N n_x, n_z)`` and b ``(N n_x,)``.
     """
     _check_form(form)

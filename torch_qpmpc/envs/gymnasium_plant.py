@@ -91,8 +91,8 @@ class GymnasiumPlant:
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
         """Make one environment; ``max_steps`` replaces the length of its episodes.
 
-        Actions within 1e-9 of their bounds' size of zero are zero, because some plants react to
-        any other.
+        Actions smaller than 1e-9 of their bounds become zero, because some plants react to the
+        tiniest one.
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
         rounded = partial(_without_rounding, env.action_space)

@@ -407,7 +407,7 @@ def improve(
         window: steps of one gradient, after which the loops go on; ``steps`` by default.
         rate: the first rate of Adam, in units of the signals.
         held_out: the number of loops that decide.
-        members: the number of models of an identified plant: the log's, and those of trajectories
+        members: the number of models of an identified plant: the log's, and others of trajectories
             drawn with replacement. A single trajectory has one.
         cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
             plant; by default the `stage_cost` of the scheme.

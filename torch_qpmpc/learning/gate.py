@@ -185,8 +185,8 @@ class Gate:
         costs: maps a policy and a seed to the costs ``(starts,)`` of closed loops, with starts and
             disturbances from the seed alone.
         pairs: the number of pairs after which an undecided comparison rejects the candidate.
-        alpha: the probability that any candidate is accepted that is no better. Comparison k, from
-            1, has the share ``K / ((K + k - 1) (K + k))`` of it; all shares sum to 1.
+        alpha: the largest probability of ever accepting a candidate that is no better. Comparison
+            k, from 1, has the share ``K / ((K + k - 1) (K + k))`` of it; all shares sum to 1.
         decisions: K, the number of comparisons that are planned.
         bound: the largest loss of one closed loop, as in `PairedTest`.
         patience: the number of rejections in a row after which the candidate becomes a copy of the

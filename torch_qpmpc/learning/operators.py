@@ -89,7 +89,7 @@ class _QPOperator(TensorDictModuleBase):
 
 
 def entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return the entry ``key``; raise `QPError` if it is missing, where V would pass for Q."""
+    """Return the entry ``key``; raise `QPError` if it is missing: without it, Q would be V."""
     value = tensordict.get(key, None)
     if value is None:
         present = ", ".join(map(str, tensordict.keys(True, True))) or "no entry"

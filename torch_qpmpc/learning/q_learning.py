@@ -37,15 +37,15 @@ class QPQLearningLoss(LossModule):
     Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
     estimator, of slices ``(*batch, n)`` have returns of several steps.
 
-    If `observe` sees all transitions, V(s+) is clipped to the value of paying the least or the
-    largest cost so far, or none, for ever (Munos and Szepesvari, "Finite-time bounds for fitted
-    value iteration", JMLR 2008). Otherwise a transition to a state that no other transition leaves
+    If `observe` sees all transitions, V(s+) is clipped to the values of paying the smallest and the
+    largest cost so far, or zero, for ever (Munos and Szepesvari, "Finite-time bounds for fitted
+    value iteration", JMLR 2008). Otherwise a transition to a state that no known transition leaves
     can raise its own target without bound.
 
     Samples whose QP has no certified solution (``on_failure="mask"`` in the QPMPC) add nothing to
     the loss and are counted in ``unsolved``; those with a NaN or infinite reward, in
     ``invalid_reward``, with a `RuntimeWarning`. The sign of the rewards is not checked: pass -L.
-    ``gamma`` belongs to `make_value_estimator`, as for any TorchRL loss.
+    Pass ``gamma`` to `make_value_estimator`, as for any TorchRL loss.
 
     Args:
         value_network: the critic to learn: a `QPActorValueOperator`, or a TensorDictSequential that

@@ -48,7 +48,7 @@ def walk(steps: TensorDictBase, preview_key: NestedKey | None = None) -> float:
     Least squares fit a linear model of the next states, and one of their changes, to consecutive
     steps ``(count, T)``. Changes of white noise have twice its variance; those of a walk are white.
     So the noise is a walk if the model of changes leaves less than half of the variance, in the
-    geometric mean over the states. A variance below `EXACT` of a state's is none.
+    geometric mean over the states. A variance below `EXACT` times a state's counts as zero.
     """
     known = ["observation"] if preview_key is None else [preview_key, "observation"]
     x = torch.cat([steps[key].double() for key in (*known, "action")], -1)

@@ -73,7 +73,7 @@ def overall(sweep: pd.DataFrame) -> str:
             lines.append(f"{escaped(noise)} noise {mean:.3f} {ends}")
     if not lines:
         return ""
-    return f"Interquartile mean over the four cases that learn C: {'; '.join(lines)}."
+    return f"Interquartile mean over the paper's four cases that learn C: {'; '.join(lines)}."
 
 
 def section(sweep: pd.DataFrame) -> str:
