@@ -7,54 +7,25 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "torch_qpmpc"
 #: For each folder or top-level module, those that it may import.
-LAYERS = {
-    "errors": set(),
-    "checks": {"errors"},
-    "files": {"errors"},
-    "loops": set(),  # the closed loop of a policy and a plant
-    "qp": {"errors", "checks"},
-    "mpc": {"errors", "checks", "files", "qp"},
-    "export": {"errors", "checks", "qp", "mpc"},
-    "proofs": {"errors", "checks", "qp", "mpc", "export"},
-    "learning": {"errors", "checks", "qp", "mpc"},
-    "envs": {"errors", "checks", "loops", "mpc"},
-    "analysis": {"errors", "checks", "qp", "mpc"},
-    "control": {
-        "errors",
-        "checks",
-        "files",
-        "loops",
-        "qp",
-        "mpc",
-        "export",
-        "learning",
-        "analysis",
-    },
-    "experiment": {
-        "errors",
-        "checks",
-        "files",
-        "qp",
-        "mpc",
-        "export",
-        "learning",
-        "envs",
-        "analysis",
-    },
-    "study": {
-        "errors",
-        "checks",
-        "files",
-        "qp",
-        "mpc",
-        "learning",
-        "envs",
-        "analysis",
-        "experiment",
-    },
-    "report": {"study"},  # `python -m torch_qpmpc.report`
-    "train": {"files"},  # `python -m torch_qpmpc.train`
+IMPORTS = {
+    "errors": "",
+    "checks": "errors",
+    "files": "errors",
+    "loops": "",  # the closed loop of a policy and a plant
+    "qp": "errors checks",
+    "mpc": "errors checks files qp",
+    "export": "errors checks qp mpc",
+    "proofs": "errors checks qp mpc export",
+    "learning": "errors checks qp mpc",
+    "envs": "errors checks loops mpc",
+    "analysis": "errors checks qp mpc",
+    "control": "errors checks files loops qp mpc export learning analysis",
+    "experiment": "errors checks files qp mpc export learning envs analysis",
+    "study": "errors checks files qp mpc learning envs analysis experiment",
+    "report": "study",  # `python -m torch_qpmpc.report`
+    "train": "files",  # `python -m torch_qpmpc.train`
 }
+LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 394,
@@ -64,9 +35,9 @@ BUDGET = {
     "experiment": 3170,
     "export": 1342,
     "learning": 2798,
-    "mpc": 5110,
+    "mpc": 5113,
     "proofs": 999,
-    "qp": 5669,
+    "qp": 5671,
     "study": 548,
 }
 #: Libraries that only some layers may import.

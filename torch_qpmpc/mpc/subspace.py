@@ -482,15 +482,18 @@ def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
         after[t] = (P + P.swapaxes(-1, -2)) / 2
     L, y = L * there[..., None, :], np.moveaxis(y, 0, 1) * there
     moved = np.moveaxis(v @ B.T, 0, 1) + _apply(A @ L, y)[:-1]
-    prior = recursion((A - A @ L @ C)[:-1], moved, np.broadcast_to(m, (G, n)).copy())
+    # Copies are contiguous, or the kernels would be compiled for each layout.
+    start = np.broadcast_to(m, (G, n)).copy()
+    prior = recursion((A - A @ L @ C)[:-1].copy(), moved.copy(), start)
     e = (y - prior @ C.T) * there
     post = prior + _apply(L, e)
     value = -(half.sum() * G / g + (_apply(inverse, e) * e).sum()) / 2
     J = np.linalg.solve(before[1 : steady + 1], A @ after[:steady][: N - 1]).swapaxes(-1, -2)
     J = J[np.arange(N - 1).clip(max=len(J) - 1)]
-    x = recursion(J[::-1], (post[:-1] - _apply(J, prior[1:]))[::-1], post[-1])[::-1]
+    back = (post[:-1] - _apply(J, prior[1:]))[::-1].copy()
+    x = recursion(J[::-1].copy(), back, post[-1].copy())[::-1]
     own = after[:-1] - J @ before[1:] @ J.swapaxes(-1, -2)
-    Ps = spread(J, own, after[-1])
+    Ps = spread(J.copy(), own.copy(), after[-1])
     return _Moments(np.moveaxis(x, 0, 1), Ps, Ps[1:] @ J.swapaxes(-1, -2), float(value))
 
 

@@ -520,8 +520,9 @@ def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
             codes[i, k] = active[i, reduced.rows[k]]
     to_g, to_lam = sensitivities.to_g, sensitivities.to_lam
     v, lam, steps, done = _try_active_sets(to_g, to_lam, group, g, lower, upper, w, codes)
+    passes = np.int64(0)  # Python's type: a literal 0 would be compiled once more
     value, z, chi, lam, xi, codes, residual, error = recover(
-        v, lam, group, fixed, theta, reduced, sizes, 0
+        v, lam, group, fixed, theta, reduced, sizes, passes
     )
     residual[~done] = np.inf
     return value, z, chi, lam, xi, 0 * steps, residual, error, steps, codes

@@ -252,7 +252,8 @@ def inverse_factors(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if singular.any():
         shifted = matrices + torch.from_numpy(shift)[:, None, None] * one
         factors, failed = torch.linalg.cholesky_ex(shifted)
-    inverses = torch.linalg.solve_triangular(factors, one, upper=False).numpy()
+    # LAPACK writes columns. Contiguous, or the kernels would be compiled for each layout.
+    inverses = torch.linalg.solve_triangular(factors, one, upper=False).contiguous().numpy()
     inverses[failed.numpy() > 0] = np.inf
     return inverses, shift
 
