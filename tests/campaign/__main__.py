@@ -127,7 +127,7 @@ def totals(tallies: dict[str, dict[str, Tally]]) -> str:
         ["with NaN or inf in a gradient", *(f"{total.not_finite:,}" for total in sums)],
         [f"slower than {SLOW} s", *(f"{total.slow:,}" for total in sums)],
         ["slowest, in seconds of one core", *(f"{total.slowest:.2f}" for total in sums)],
-        ["largest error of what is certified", *(f"{total.error:.0e}" for total in sums)],
+        ["largest error of a certified answer", *(f"{total.error:.0e}" for total in sums)],
     ]
     return table(["", *tallies], lines)
 
