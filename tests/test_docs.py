@@ -41,12 +41,6 @@ def commands(text: str) -> list[list[str]]:
 COMMANDS = {page: commands(text) for page, text in PAGES.items()}
 
 
-def test_blocks_are_found():
-    text = "a\n```bash\nls \\\n -l # all\n```\n```python\nx = 1\n```\nb\n```python t\ny = 2\n```\n"
-    assert fenced(text, "python") == [(6, "x = 1\n"), (10, "y = 2\n")]
-    assert commands(text) == [["ls", "-l"]]
-
-
 #: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs,
 #: and the tests of `improve` have shorter loops.
 SLOW = [f"docs/guides/{x}.md" for x in ("torchrl", "environment", "prove", "closed-loops")]

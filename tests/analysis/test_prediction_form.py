@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.problems import normal, predict, times
+from tests.problems import normal
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.structure import prediction_form
 from torch_qpmpc.mpc.layout import banded_matrix
@@ -33,18 +33,6 @@ def gauge(seed: int) -> Tensor:
     return normal(N * N_X, N * N_X, seed=100 + seed)
 
 
-def test_blocks_and_maps_are_the_form():
-    form = prediction_form(*_of("free"))
-    x_0, U = normal(N_X), normal(N, N_U, seed=1)
-    predicted = predict(form, x_0, U)
-    by_blocks = torch.einsum("kjxu,ju->kx", form.blocks, U)
-    by_blocks += times(form.Phi, x_0).view(N, N_X) + form.phi.view(N, N_X)
-    torch.testing.assert_close(by_blocks, predicted)
-    by_maps = times(form.maps, torch.cat((x_0, U.flatten(), torch.ones(1).double())))
-    torch.testing.assert_close(by_maps[0], x_0)
-    torch.testing.assert_close(by_maps[1:], predicted)
-
-
 def test_a_batch_is_its_elements():
     both = [constraints("free", seed) for seed in (0, 1)]
     C, b = (torch.stack(parts) for parts in zip(*both, strict=True))
@@ -58,15 +46,6 @@ def test_a_batch_is_its_elements():
 def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:
     C, b = constraints(kind)
     return C, N_X, N_U, b
-
-
-def test_a_small_C_is_as_good_as_any():
-    C, n_x, n_u, b = _of("free")
-    scale = torch.logspace(-12, 3, len(C)).double().unsqueeze(-1)
-    form = prediction_form(C, n_x, n_u, b)
-    scaled = prediction_form(scale * C, n_x, n_u, scale[:, 0] * b)
-    torch.testing.assert_close(scaled.Gamma, form.Gamma)
-    torch.testing.assert_close(scaled.condition, form.condition)
 
 
 def test_a_C_that_does_not_determine_the_states_is_refused():

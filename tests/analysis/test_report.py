@@ -76,22 +76,6 @@ def test_the_gain_is_taken_at_the_given_state():
     assert (read(mpc).K.abs() > 0.1).any()
 
 
-def test_metrics_are_those_of_the_report():
-    mpc = scheme()
-    with torch.no_grad():
-        mpc.C += 0.05 * normal(*mpc.C.shape)
-    found, metrics = read(mpc, (A, B)), structure_metrics(mpc, (A, B))
-    expected = {
-        "causality_defect": found.causality,
-        "toeplitz_defect": found.toeplitz,
-        "distance_to_mpc": found.distance_to_mpc,
-        "model_error": found.model_error,
-    }
-    assert metrics == pytest.approx(expected)
-    del expected["model_error"]
-    assert structure_metrics(mpc) == pytest.approx(expected)
-
-
 @pytest.mark.parametrize("value", [0.0, torch.nan])
 def test_metrics_of_a_C_that_cannot_be_read_are_nan(value):
     mpc = scheme()

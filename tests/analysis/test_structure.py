@@ -16,13 +16,11 @@ from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.structure import (
     NearestModel,
     PredictionForm,
-    canonical_matrix,
     causality_defect,
     distance_by_band,
     nearest_model,
     one_step_error,
     prediction_form,
-    second_moment,
     stage_models,
     toeplitz_defect,
 )
@@ -60,16 +58,6 @@ def free_form(seed: int = 0) -> PredictionForm:
     return form_of(banded_matrix(0.5 * A, B, N) + 0.1 * normal(*C_0.shape, seed=seed))
 
 
-def scheme_with(*earlier: Tensor) -> Tensor:
-    """Make C of x_{k+1} = A x_k + B u_k plus terms in (x_j, u_j) for j = k - 1, k - 2, ..."""
-    C, n = banded_matrix(0.3 * A, B, N), N_X + N_U
-    for back, block in enumerate(earlier, start=1):
-        for k in range(back, N):
-            first = (k - back) * n
-            C[k * N_X : (k + 1) * N_X, first : first + n] = block
-    return C
-
-
 def test_defects_are_sums_over_blocks():
     form = free_form()
     total = above = departure = 0.0
@@ -88,13 +76,6 @@ def test_defects_are_sums_over_blocks():
     assert above > 0.01 * total
 
 
-def test_defects_of_a_batch():
-    forms = [free_form(seed) for seed in (0, 1)]
-    C = torch.stack([canonical_matrix(form, stage_models(form).A)[0] for form in forms])
-    for defect in (causality_defect, toeplitz_defect):
-        torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
-
-
 def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
     A_k, B_k = A + 0.1 * normal(N, N_X, N_X, seed=3), B + 0.1 * normal(N, N_X, N_U, seed=4)
     c_k = normal(N, N_X, seed=5)
@@ -106,16 +87,6 @@ def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
     assert causality_defect(form) < 1e-12
     assert toeplitz_defect(form) > 0.01
     assert nearest_model(form).residual > 0.01
-
-
-def test_the_nearest_of_schemes_that_differ_in_B_alone_has_its_mean():
-    gains = torch.tensor([0.9, 1.3, 1.0, 0.8], dtype=torch.float64)
-    form = model_form(torch.zeros(1, 1).double(), gains.view(N, 1, 1), N)
-    found = nearest_model(form)
-    assert found.B.item() == pytest.approx(1.0, abs=1e-9)
-    assert found.A.abs().item() < 1e-9
-    expected = ((gains - 1).norm() / gains.norm()).item()
-    assert found.residual.item() == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -156,15 +127,6 @@ def test_a_search_ends_whose_minimum_is_far(monkeypatch):
     assert len(fits) == 1
 
 
-def test_the_distance_grows_with_the_perturbation():
-    noise = normal(*C_0.shape, seed=6)
-    forms = [form_of(C_0 + size * noise) for size in (1e-6, 1e-4, 1e-2)]
-    distances = [nearest_model(form).residual.item() for form in forms]
-    assert 1e-8 < distances[0] < 1e-4
-    assert distances[1] / distances[0] == pytest.approx(100, rel=0.01)
-    assert distances[2] > 50 * distances[1]
-
-
 @pytest.mark.parametrize(("stages", "most"), [((1.0, 1e4), 0.01), ((1.0, 1e6, 1e-6) * 20, 1.0)])
 def test_a_one_step_fit_that_explodes_is_no_start(stages, most):
     """Over the horizon it predicts worse than zero, or overflows."""
@@ -186,17 +148,7 @@ def test_directions_that_no_prediction_reaches_are_not_made_up():
     torch.testing.assert_close(nearest_model(form).A, nilpotent)
 
 
-def test_an_older_pair_is_in_the_residual_of_the_stages():
-    """In any gauge, and causally."""
-    T = normal(N * N_X, N * N_X, seed=8)
-    form = form_of(T @ scheme_with(0.3 * normal(N_X, N_X + N_U, seed=9)))
-    assert stage_models(form).residual[1:].min() > 1e-3
-    assert causality_defect(form) < 1e-10
-    assert stage_models(form_of(T @ scheme_with())).residual.max() < 1e-9
-
-
 TRUE_A, TRUE_B, OFFSET = normal(3, 3, seed=1), normal(3, 2, seed=2), normal(3, seed=3)
-S, ACTIONS = 2 * normal(50, 3, seed=4) + 1, normal(50, 2, seed=5)
 
 
 def model(*stages: int) -> NearestModel:
@@ -208,15 +160,6 @@ def model(*stages: int) -> NearestModel:
         OFFSET + 0.1 * normal(*stages, 3, seed=8),
         residual,
     )
-
-
-def test_error_over_samples_is_their_root_mean_square():
-    wrong = model(4)
-    found = one_step_error(wrong, TRUE_A, TRUE_B, OFFSET, second_moment(S, ACTIONS))
-    truth = S @ TRUE_A.mT + ACTIONS @ TRUE_B.mT + OFFSET
-    for k in range(4):
-        error = S @ wrong.A[k].mT + ACTIONS @ wrong.B[k].mT + wrong.offset[k] - truth
-        assert found[k].item() == pytest.approx(error.square().sum(-1).mean().sqrt().item())
 
 
 def test_error_over_unit_variance_is_the_frobenius_norm():

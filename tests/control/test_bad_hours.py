@@ -278,34 +278,6 @@ def test_c_and_python_do_the_same_in_all_bad_hours():
         assert counts["manual steps"] == 150
 
 
-def test_large_estimates_leave_the_same_input_of_each_step():
-    """Rounding grows fivefold in a step if outputs that do not answer are replayed.
-
-    So each step starts from the same estimates.
-    """
-    rng = np.random.default_rng(3)
-    n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
-    A = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n))
-    B, C = rng.normal(size=(n, m)), rng.normal(size=(1, n))
-    bounds: dict[str, Any] = {
-        "u_bounds": (-1.0, 1.0),
-        "y_bounds": (-2.0, 2.0),
-        "du_bounds": (-0.4, 0.4),
-    }
-    mpc = qm.LinearMPC((A, B, C), 8, Q=1.0, R=0.01, dR=0.1, **bounds)
-    controller, twin = exported(lambda: qm.Controller(mpc))
-    size, largest = len(controller.observer.F), 0.0
-    for k in range(100):
-        y, r = rng.normal(size=1) * (10 if k % 10 == 0 else 1), rng.normal(size=1)
-        if k:
-            state = np.concatenate((controller.x, controller.w, controller.u))
-            twin._state[: 8 * (size + m)] = state.view(np.uint8)
-        u, code = twin.step(y, r)
-        largest = max(largest, np.abs(u - controller.step(y, r)).max())
-        assert code == controller.status
-    assert largest < 1e-8
-
-
 DRIVER = """#include <stdio.h>
 #include "policy.h"
 int main(void)

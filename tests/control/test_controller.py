@@ -12,16 +12,10 @@ import torch
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
-from torch_qpmpc.control.observer import kalman
 from torch_qpmpc.control.state_space import read_model
 
 A = np.array([[1.0, 0.1], [0.0, 0.8]])
 B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
-PAIR = (
-    scipy.linalg.block_diag([[0.9, 0.3], [-0.2, 0.8]], [[0.7, 0.1], [0.0, 0.6]]),
-    np.array([[0.2, 0.0], [0.5, 0.1], [0.1, 0.0], [0.0, 0.4]]),
-    np.array([[1.0, 0.0, 0.2, 0.0], [0.0, 0.0, 1.0, 0.0]]),
-)
 BOUNDS = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.3, 0.3)}
 
 
@@ -84,16 +78,6 @@ def test_a_reset_starts_where_the_plant_rests():
     controller.reset()
     assert controller.target is None
     assert np.allclose(controller.step([3.0], [3.0]), [0.0])
-
-
-def test_the_filter_is_stable_and_faster_with_more_drift():
-    design, noise = integrator().design, np.array([0.1])
-
-    def radius(drift):
-        observer = kalman(design, noise, np.array([drift]))
-        return np.abs(np.linalg.eigvals(observer.F - observer.F @ observer.L @ observer.H)).max()
-
-    assert radius(1.0) < radius(0.01) < 1
 
 
 @pytest.mark.parametrize(

@@ -115,19 +115,6 @@ def test_noise_is_drawn_from_the_seed():
     assert not np.array_equal(runs[0], runs[2])
 
 
-def test_an_environment_whose_observations_are_outputs_is_a_plant():
-    class Lag(gymnasium.Env):
-        def reset(self, *, seed=None, options=None):
-            self.x = np.zeros(1)
-            return self.x, {}
-
-        def step(self, action):
-            self.x = 0.85 * self.x + 0.5 * action
-            return self.x, 0.0, False, False, {}
-
-    assert np.abs(made().simulate(Lag(), 120, r=[1.0]).y[-1] - 1.0) < 1e-5
-
-
 def test_an_environment_forecasts_the_known_signals():
     class Rain(gymnasium.Env):
         """y+ = 0.9 y + 0.5 u + 0.3 rain, with a forecast of 11 rows or of none."""

@@ -64,13 +64,6 @@ def test_episodes_start_at_one_state_without_a_draw():
         assert s[1].tolist() == [0, 0.15], "memory of its own"
 
 
-def test_wrong_model():
-    A, B = GrosZanonLTI().wrong_model()
-    assert A.tolist() == [[1, 0.25], [0, 1]]
-    assert B.tolist() == [[0.0312], [0.25]]
-    assert A.dtype == B.dtype == torch.float64
-
-
 def test_the_true_model_has_the_mean_of_the_noise():
     plant = GrosZanonLTI()
     A, B, offset = plant.true_model()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import gymnasium
@@ -288,9 +287,3 @@ def test_violation_is_the_distance_to_the_box():
     plant = GymnasiumPlant("Pendulum-v1")
     s = torch.tensor([[1.0, 0.0, -8.0], [1.5, -1.25, 9.0]])
     assert plant.violation(s).tolist() == [0, 1.75]
-
-
-def test_a_space_without_bounds_has_none(register):
-    plant = GymnasiumPlant(register(observations=Box(-math.inf, math.inf, (1,), np.float32)))
-    assert plant.ub_s.isinf().all()
-    assert plant.violation(torch.tensor([[1e9]])) == 0

@@ -44,35 +44,6 @@ class StaggeredEnv(Staggered, LinearSystemEnv):
 # --- LinearSystem ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [np.random.default_rng, torch.Generator().manual_seed])
-def test_both_kinds_of_generators_draw_the_same_shapes(plant, make):
-    n_x = plant.A.shape[0]
-    starts, draw = plant.starts(make(1), 5), plant.draw(make(1), 5)
-    nu = plant.noise(torch.zeros(5, n_x), draw)
-    assert starts.shape == nu.shape == (5, n_x)
-    assert draw.shape[0] == 5
-    assert starts.dtype == draw.dtype == nu.dtype == torch.float64
-    assert torch.equal(plant.starts(make(1), 5), starts)
-    assert torch.equal(plant.draw(make(1), 5), draw)
-    assert not torch.equal(plant.draw(make(2), 5), draw)
-    assert len(draw[:, 0].unique()) == 5
-
-
-def test_batches_have_any_shape(plant):
-    n_x, n_u = plant.B.shape
-    s, a = plant.starts(np.random.default_rng(0), 6), torch.linspace(-2, 2, 6 * n_u).view(6, n_u)
-    draw = plant.draw(np.random.default_rng(1), 6)
-
-    def following(s, a, draw):
-        return plant.step(s, a, plant.noise(torch.zeros_like(s), draw))
-
-    flat, cost = following(s, a, draw), plant.cost(s, a)
-    s, a, draw = (x.view(2, 3, -1) for x in (s, a, draw))
-    assert plant.cost(s, a).shape == (2, 3)
-    torch.testing.assert_close(plant.cost(s, a).flatten(), cost)
-    torch.testing.assert_close(following(s, a, draw).view(6, n_x), flat)
-
-
 def test_moving_keeps_every_field(plant):
     moved = plant.to("meta")
     assert type(moved) is type(plant)

@@ -75,18 +75,6 @@ def test_gaussian_noise_is_independent_and_brownian_noise_a_random_walk():
         assert correlation == pytest.approx(correlated, abs=0.02)
 
 
-def test_corrupted_draws_A_then_B_then_theta():
-    p, rng = PointMass(), np.random.default_rng(3)
-    dA, dB = rng.uniform(-0.05, 0.05, (4, 4)), rng.uniform(-0.05, 0.05, (4, 2))
-    theta = rng.uniform(0.5, 5, 4)
-    A_hat, B_hat, theta_hat = p.corrupted(3)
-    torch.testing.assert_close(A_hat - p.A, torch.tensor(dA), atol=1e-15, rtol=0)
-    torch.testing.assert_close(B_hat - p.B, torch.tensor(dB), atol=1e-15, rtol=0)
-    assert theta_hat.tolist() == theta.tolist()
-    assert all(torch.equal(x, y) for x, y in zip(p.corrupted(3), p.corrupted(3), strict=True))
-    assert not torch.equal(p.corrupted(4)[0], A_hat)
-
-
 def test_the_kind_alone_changes_the_default_noise():
     assert replace(PointMass(), noise_kind="brownian").std == 0.002
     assert PointMass("brownian", noise_std=0.5).std == 0.5
@@ -99,23 +87,6 @@ def test_bad_noise_is_an_error():
     for std in (-0.1, float("nan"), float("inf")):
         with pytest.raises(QPError, match=rf"noise_std: got {std}, expected a finite number >= 0"):
             PointMass(noise_std=std)
-
-
-def test_starts_fill_their_range():
-    s = PointMassEnv(4000, seed=0).reset()["observation"]
-    limits = torch.tensor([1.5, 1.5, 0.5, 0.5])
-    assert (s.abs() <= limits).all()
-    torch.testing.assert_close(s.std(0), limits / 3**0.5, atol=0, rtol=0.05)
-    assert (PointMass().starts(np.random.default_rng(0), 4000).abs().amax(0) > 0.99 * limits).all()
-
-
-def test_gymnasium_random_walk_restarts_with_the_episode():
-    env = PointMassGymEnv(PointMass("brownian", noise_std=1.0))
-    first, _ = env.reset(seed=1)
-    one = env.step(np.zeros(2, dtype=np.float32))[0]
-    again, _ = env.reset(seed=1)
-    np.testing.assert_array_equal(again, first)
-    np.testing.assert_array_equal(env.step(np.zeros(2, dtype=np.float32))[0], one)
 
 
 @pytest.mark.parametrize("kind", STREAMS)
@@ -144,13 +115,6 @@ def test_corrupted_stays_as_it_was():
     np.testing.assert_allclose(B_hat[0], [0.03631789223498866, 0.004146122024909174], atol=1e-15)
     expected = [3.2692330016656426, 2.2265489941784757, 4.98744471105145, 4.913759024493036]
     np.testing.assert_allclose(theta, expected, atol=1e-14)
-
-
-def test_the_true_model_has_no_offset():
-    A, B, offset = PointMass().true_model()
-    assert torch.equal(A, PointMass().A)
-    assert torch.equal(B, PointMass().B)
-    assert offset.tolist() == [0] * 4
 
 
 def test_environments_are_of_fifty_steps_with_the_papers_bounds():

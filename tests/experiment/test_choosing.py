@@ -237,19 +237,6 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
     assert_close(difference, (R / 8).expand(8), rtol=1e-4, atol=0)
 
 
-def test_the_gate_copies_a_held_action_into_the_scheme_that_learning_begins_with():
-    cfg = make_config(*DATA, "task.hessian=diagonal", "task.learn_cost=[q,c]")
-    physics: Any = make_physics(cfg)
-    start = start_of(cfg, physics)
-    physics = start.plant(physics)
-    held, scheme = (
-        make_mpc(cfg, physics, start),
-        make_mpc(cfg, physics, start._replace(action=None)),
-    )
-    scheme.load_state_dict(held.state_dict())
-    assert scheme.policy(torch.ones(1, physics.n_x, dtype=torch.float64)).abs() < 1e-12
-
-
 def trained(cfg, folder) -> FinishedRun:
     """Train; the files have the policies that were evaluated."""
     summary, run = train.train(cfg, str(folder), quiet=True), FinishedRun(folder)

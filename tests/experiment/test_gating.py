@@ -104,12 +104,6 @@ def test_a_gate_that_only_keeps_does_not_change_what_is_learned(tmp_path):
     assert ends["true"]["J_final"] == ends["false"]["J_final"]
 
 
-def test_no_candidate_passes_under_a_bound_far_above_its_gain(tmp_path):
-    summary = train.train(make_config(*GATED, "updates=3", "gate_bound=1e9"), str(tmp_path))
-    assert (summary["accepted"], summary["rejected"]) == (0, 1)
-    assert summary["J_best"] == summary["J_start"] != summary["J_final"]
-
-
 def test_without_an_interval_of_its_own_each_evaluation_is_judged():
     gate, _ = make_gate("gate=true", "gate_interval=null", "updates=8")
     assert [bool(gate.judge(update)) for update in range(1, 9)] == [False, True] * 4

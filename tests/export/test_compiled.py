@@ -13,11 +13,8 @@ import pytest
 import torch
 
 from tests.exported import rates, tied
-from torch_qpmpc import QPMPC, CompiledPolicy, QPError, SolverError
-from torch_qpmpc.envs import PointMass
-from torch_qpmpc.envs.closed_loop import closed_loop
+from torch_qpmpc import CompiledPolicy, QPError, SolverError
 from torch_qpmpc.export import library
-from torch_qpmpc.learning.operators import warm_policy
 
 needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
 
@@ -49,16 +46,6 @@ def test_each_row_of_a_batch_is_a_controller():
     policy.reset()
     policy(s)
     np.testing.assert_array_equal(policy.last.iterations, first)
-
-
-@needs_compiler
-def test_the_closed_loop_has_the_same_cost():
-    physics = PointMass()
-    bounds = {"action_bounds": ([-1, -1], [1, 1]), "state_bounds": (physics.lb_s, physics.ub_s)}
-    cost = {"stage_weight": [2.0, 2.0, 1.0, 1.0, 0.1, 0.1]}
-    mpc = QPMPC.from_model(physics.A, physics.B, 5, solver="daqp", **bounds, **cost)
-    J = [closed_loop(f, physics, starts=4).J for f in (CompiledPolicy(mpc), warm_policy(mpc))]
-    assert J[0] == pytest.approx(J[1], rel=1e-9)
 
 
 @needs_compiler

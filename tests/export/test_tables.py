@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
-from tests.exported import SCHEMES, draw_known, random_qp
-from torch_qpmpc import QPMPC, QPError, solve_qp
+from tests.exported import SCHEMES, random_qp
+from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.export.tables import make_tables
-
-
-@pytest.mark.parametrize("name", ["point mass", "house", "tied", "rates"])
-def test_the_value_and_action_without_rows_are_those_of_the_equalities(name):
-    mpc = SCHEMES[name]()
-    tables = make_tables(mpc)
-    qp = mpc.quadratic_program()
-    rows = {name: getattr(qp, name).detach()[:0] for name in ("G", "lb", "ub", "w")}
-    without = dataclasses.replace(qp, **rows, check_values=False, n_known=0)
-    p = draw_known(mpc, 20)
-    with torch.no_grad():
-        solution = solve_qp(without, torch.as_tensor(p))
-    value = np.einsum("bi,ij,bj->b", p, tables.P, p) / 2 + p @ tables.g + tables.c
-    np.testing.assert_allclose(value, solution.value, rtol=1e-7, atol=1e-7)
-    u = solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u]
-    np.testing.assert_allclose(p @ tables.K.T + tables.k, u, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

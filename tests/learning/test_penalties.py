@@ -142,14 +142,6 @@ def test_system_identification_penalty_window_by_window(generator):
     )
 
 
-def test_system_identification_penalty_has_the_right_gradient(generator):
-    C = normal(generator, N * N_X, N_Z).requires_grad_()
-    b = normal(generator, N * N_X).requires_grad_()
-    windows = normal(generator, 7, N_Z)
-    penalty = SystemIdentificationPenalty(0.1)
-    assert torch.autograd.gradcheck(lambda x, y: penalty(x, windows, y), (C, b))
-
-
 def test_true_model_explains_noise_free_windows(generator):
     physics, horizon = PointMass(noise_std=0.0), 5
     s, entries = 0.5 * normal(generator, 6, 4), []

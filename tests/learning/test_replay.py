@@ -6,7 +6,7 @@ import io
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 
@@ -116,21 +116,6 @@ def test_stored_transitions_are_sampled_uniformly():
     assert hits.any(1).all(), "only the newest 10 rows are there"
     assert hits.sum(0).min() > 60, "each of 80 is expected 100 times in 8000"
     assert hits.sum(0).max() < 145
-
-
-def test_tau_has_the_order_of_z():
-    z = torch.arange(2 * (N * 6 + 4), dtype=torch.float32).reshape(2, -1)
-    pairs = z[:, :-4].unflatten(1, (N, 6))
-    following = torch.cat([pairs[:, 1:, :4], z[:, None, -4:]], dim=1)
-    td = TensorDict(
-        {
-            "observation": pairs[..., :4],
-            "action": pairs[..., 4:],
-            "next": {"observation": following},
-        },
-        batch_size=[2, N],
-    )
-    assert torch.equal(windows_to_tau(td), z)
 
 
 def test_tau_begins_with_all_that_is_known():

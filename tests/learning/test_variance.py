@@ -6,11 +6,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.examples import example
 from tests.problems import normal
-from torch_qpmpc import QPMPC, GaussNewton
 from torch_qpmpc.learning.td_error import FLOOR, inverse_variance
-from torch_qpmpc.mpc.riccati import lqr_gain
 
 COUNT = 4000
 
@@ -62,44 +59,3 @@ def test_few_pairs_or_errors_of_zero_have_weight_one():
     few = slice(0, 15)
     assert (inverse_variance(p[few], a[few], value[few], a[few, 0], use[few]) == 1).all()
     assert (inverse_variance(p, a, value, torch.zeros(COUNT).double(), use) == 1).all()
-
-
-def learned_gain(weighted: bool) -> Tensor:
-    """Learn H, H_f and c of a QP with N = 1 by fitted Q iteration; return its policy's gain."""
-    plant = example("actuator_noise").ActuatorNoise()
-    mpc = QPMPC.from_model(
-        plant.A,
-        plant.B,
-        1,
-        gamma=0.95,
-        hessian="block",
-        stage_weight=plant.W,
-        terminal_weight="riccati",
-        learn=("H", "H_f", "c"),
-        solver="daqp",
-    )
-    x, w = 2 * normal(600, 2, seed=0), normal(600, 3, seed=1) * torch.tensor([1.2, 0.02, 0.02])
-    u = -x @ torch.tensor([[3.0], [2.5]]).double() + normal(600, 1, seed=2)
-    cost, following = plant.cost(x, u, w), plant.step(x, u, w)
-    optimizer = GaussNewton(mpc, weighted=weighted)
-    for _ in range(20):
-        optimizer.step(x, u, cost + 0.95 * mpc.value(following).detach())
-    unit = torch.eye(2).double()
-    return (mpc.policy(0 * unit) - mpc.policy(unit)).detach().mT
-
-
-def test_weighted_q_learning_finds_the_optimal_gain_under_actuator_noise():
-    """That of the generalised Riccati equation; without weights a few errors dominate."""
-    plant = example("actuator_noise").ActuatorNoise()
-    noisy_stage_weight = example("actuator_noise").noisy_stage_weight
-    weight = noisy_stage_weight(plant.A, plant.B, plant.W, 0.95, plant.actuator_std)
-    K = lqr_gain(plant.A, plant.B, weight, 0.95)
-    weighted, plain = ((learned_gain(x) - K).norm() / K.norm() for x in (True, False))
-    assert weighted < 0.2
-    assert plain > 2 * weighted
-
-
-def test_equal_inputs_leave_the_weights_finite():
-    p, a, value, use = (x[:50] for x in pairs())
-    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
-    assert weight.isfinite().all()

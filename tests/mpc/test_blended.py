@@ -66,12 +66,6 @@ def test_the_linearisation_is_the_derivative_of_the_model(model):
     assert model.linearised(s.view(2, 3, 2))[2].shape == (2, 3, 2)
 
 
-def test_states_and_actions_broadcast(model):
-    s, u = states(3), torch.rand(3, 1).double()
-    assert_close(model(s, u[0]), model(s, u[:1].expand(3, 1)))
-    assert_close(model(s[0], u), model(s[:1].expand(3, 2), u))
-
-
 def test_one_centre_is_the_linear_model():
     log = pendulum_log()
     A, _, offset = qm.identify_blended(log, N, centres=1).linearised(states())
@@ -206,12 +200,6 @@ def test_what_needs_one_model_for_all_states_says_so(use, model):
 @pytest.mark.filterwarnings("ignore:In this log:UserWarning")
 def fitted(log: Any, **arguments: Any) -> BlendedModel:
     return BlendedModel(**qm.identify_blended(log, 3, centres=2).arguments | arguments)
-
-
-def test_an_empty_batch_has_no_values(model):
-    mpc, none = scheduled(model), torch.zeros(3, 0, 2)
-    assert mpc.value(none).shape == (3, 0)
-    assert mpc.policy(none).shape == (3, 0, 1)
 
 
 @pytest.mark.parametrize(

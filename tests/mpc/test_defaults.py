@@ -70,10 +70,6 @@ def test_a_reference_in_the_preview_is_reached(make, horizon):
     assert y.item() == pytest.approx(55.0, abs=1e-2 if horizon > 1 else 0.1)  # u costs a little
 
 
-def test_a_random_start_keeps_the_identity():
-    assert QPMPC.of(2, 1, 3).H_f.tolist() == [1.0, 1.0]
-
-
 # The stage cost
 
 
@@ -107,16 +103,6 @@ def test_from_data_fits_the_cost_to_the_rewards(hessian):
     assert (own.q == 0).all()
 
 
-def test_from_data_refuses_a_log_without_rewards():
-    message = r"^stage_weight: got none, and a log without rewards, expected a weight, or finite"
-    with pytest.raises(QPError, match=message):
-        QPMPC.from_data(arx_log(), 3)
-    log, _ = rewarded()
-    log["next", "reward"][0, 3] = torch.nan
-    with pytest.raises(QPError, match=r"^stage_weight: got none, and a log with rewards of NaN"):
-        QPMPC.from_data(log, 3)
-
-
 def test_a_random_start_warns_once_when_its_policy_acts():
     assert "at random" in (QPMPC.of.__doc__ or "").splitlines()[0]
     mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
@@ -136,9 +122,3 @@ def test_a_random_start_warns_once_when_its_policy_acts():
         loaded.load_state_dict(mpc.state_dict())
         loaded.policy_and_active_set(s)
         QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1]).policy(s)
-
-
-def test_a_random_start_compiles():
-    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
-    compiled = torch.compile(mpc.policy, backend="eager", fullgraph=True)
-    assert_close(compiled(s), mpc.policy(s))

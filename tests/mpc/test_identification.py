@@ -48,12 +48,6 @@ def test_a_qp_starts_from_the_model_of_the_outputs(structure):
     assert_close(x[1:], x[:-1] @ A.mT + u @ B.mT + 0.3, rtol=1e-7, atol=1e-7)
 
 
-def test_a_missing_stage_weight_is_fitted_to_the_rewards():
-    mpc = QPMPC.from_data(lag_log(), N, learn=(), solver="daqp")
-    weight = torch.tensor([2.0, 2.0, 0.2]).double()
-    assert_close(mpc.quadratic_program().H[:3, :3], torch.diag(weight), rtol=1e-6, atol=1e-6)
-
-
 def test_a_qp_of_an_identification_acts_on_its_states():
     found = qm.identify(arx_log(noise=0.2, steps=200), N, n_d=1, order=5)
     n = len(found.model.A)
@@ -78,8 +72,8 @@ def test_the_report_is_printed():
     assert all(len(row.split()) == 5 for row in rows)
 
 
-@pytest.mark.parametrize("late", [0, 1])
-@pytest.mark.parametrize("unit", [1.0, 1e6])
+@pytest.mark.usefixtures("rough_fits")
+@pytest.mark.parametrize(("late", "unit"), [(0, 1.0), (1, 1.0), (1, 1e6)])
 def test_the_report_says_that_inputs_are_logged_a_row_late(late, unit):
     rng = np.random.default_rng(0)
     u, y = rng.uniform(-1, 1, 302), np.zeros(302)

@@ -190,30 +190,3 @@ def test_order_and_lags_are_those_of_the_least_held_out_errors():
     assert (whiteness(fit.model, data) >= 0.8).all()
     coloured = fit.model._replace(L=0 * fit.model.L)
     assert whiteness(coloured, data).max() < 0.6
-
-
-def test_process_and_sensor_noise_may_be_one_source():
-    rng, K = np.random.default_rng(6), np.array([[0.6, 0.0], [-0.5, 0.4], [0.0, 0.6]])
-
-    def log(count: int) -> list[Trajectory]:
-        data = []
-        for u, e in zip(
-            rng.uniform(-1, 1, (count, 100, 2)), 0.3 * rng.normal(size=(count, 101, 2)), strict=True
-        ):
-            x, y = np.zeros(3), []
-            for k in range(101):
-                y.append(C @ x + e[k])
-                x = A @ x + B @ u[min(k, 99)] + K @ e[k]
-            data.append(trajectory(np.array(y), u))
-        return data
-
-    model, L = fit_state_space(log(20), lags=10).model, np.linalg.solve(A, K)
-    none, S = np.zeros((3, 0)), 0.09 * np.eye(2)
-    true = Innovations(A, B, none, np.zeros(3), C, L, S, np.zeros(3), np.zeros((3, 3)))
-    np.testing.assert_allclose(model.S, S, atol=0.008)
-    fresh = arrays(log(10))
-    own, best = (
-        np.concatenate([form.errors(y, u, d, 5)[20:] for y, u, d in fresh])
-        for form in (model, true)
-    )
-    assert (np.nanmean(own**2, 0) / np.nanmean(best**2, 0)).max() < 1.1

@@ -268,12 +268,6 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
     assert len(log.notes) == 1 + len(caught)
 
 
-def test_a_short_log_is_not_called_collinear():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        qm.read_log(room(4), **NAMES)
-
-
 @pytest.mark.parametrize(
     ("data", "options", "message"),
     [
@@ -431,11 +425,6 @@ def test_padded_steps_are_left_out():
     assert steps_of(padded) == [12, 28]
     padded["action"][0, 20] = torch.nan
     assert steps_of(padded) == [12, 28]
-
-
-def test_steps_sampled_at_random_are_trajectories_of_one_step():
-    log = arx_log().reshape(-1)
-    assert steps_of(log[torch.arange(119, 69, -1)]) == [1] * 50
 
 
 def test_folds_hold_each_step_once():

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
-import scipy.signal
 import torch
 
 from torch_qpmpc import Layout, Model, QPError, Scheme
@@ -32,13 +30,6 @@ def test_its_tensors_are_copies_in_double_precision():
     mine.mul_(2)
     assert torch.equal(model.A, torch.eye(2).double())
     assert model.B.dtype == torch.float64
-
-
-def test_a_discrete_system_of_scipy_has_a_model():
-    matrices = ([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]], np.eye(2), np.zeros((2, 1)))
-    system: Any = scipy.signal.dlti(*matrices, dt=0.1)
-    model = Model(system.A, system.B)
-    assert (model.A.tolist(), model.B.tolist()) == matrices[:2]
 
 
 @pytest.mark.parametrize(

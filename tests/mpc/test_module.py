@@ -73,15 +73,6 @@ def test_the_value_is_the_least_action_value_and_that_of_the_policy(name):
     assert (Q - V).max() > 1e-3
 
 
-@pytest.mark.parametrize("free", [0.0, 0.3])
-def test_the_policy_exceeds_bounds_only_if_they_are_soft_and_that_pays(free):
-    a = random_mpc(3, free=free).policy(random_states(40, size=4.0))
-    assert a.abs().max() <= 0.5 + 1e-8
-    assert a.abs().max() > 0.5 - 1e-6  # reaches them, too
-    soft = random_mpc(3, free=0.0, A=A, B=B, action_slack=1e-3, state_slack=1e3)
-    assert soft.policy(random_states(40, size=4.0)).abs().max() > 0.6
-
-
 @pytest.mark.parametrize("horizon", [1, 3, 8])
 @pytest.mark.parametrize("n_d", [0, N_D])
 def test_without_active_bounds_it_is_the_linear_quadratic_regulator(horizon, n_d):
@@ -231,13 +222,6 @@ def test_outputs_have_the_batch_and_the_dtype_of_the_states(batch, dtype):
     assert_close(outputs[0], mpc.value(s.double()).to(dtype))
 
 
-def test_states_and_actions_broadcast():
-    mpc, s, a = random_mpc(6), random_states(3), random_states(4, 1, size=0.5)
-    grid = mpc.action_value(s.unsqueeze(1), a)
-    assert grid.shape == (3, 4)
-    assert_close(grid[2, 1], mpc.action_value(s[2], a[1]))
-
-
 # The program
 
 
@@ -307,15 +291,6 @@ def test_stages_may_have_weights_and_models_of_their_own():
     assert_close(mpc.C, mpc.C_0)
 
 
-@pytest.mark.parametrize("hessian", ["block", "full"])
-@pytest.mark.parametrize("horizon", [2, 3])
-def test_a_dense_stage_weight_is_one_block_whatever_the_horizon(hessian, horizon):
-    options = {"stage_weight": W, "terminal_weight": [1.0, 1.0]}
-    mpc = QPMPC.of(2, 1, horizon, gamma=1.0, hessian=hessian, **options)
-    H = mpc.quadratic_program().H
-    assert_close(H, torch.block_diag(*[W] * horizon, torch.eye(2).double()))
-
-
 def test_random_starts_are_those_of_the_seed_alone():
     torch.manual_seed(0)
     before = torch.get_rng_state()
@@ -335,16 +310,6 @@ def test_readable_parts_are_the_model_and_the_rows():
 
 
 # Learning
-
-
-def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
-    mpc = random_mpc(
-        9, free=0.0, learn=("w", "lb", "ub"), state_bounds=([-1.0, -torch.inf], [1, 1])
-    )
-    mpc.value(random_states(6)).sum().backward()
-    for name, parameter in mpc.named_parameters():
-        assert parameter.grad is not None
-        assert parameter.grad.isfinite().all(), name
 
 
 def test_parameter_groups_have_a_rate_for_each_part():
@@ -653,11 +618,3 @@ def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
 def test_the_plan_that_is_predicted_has_the_size_of_z():
     with pytest.raises(QPError, match=r"z: got shape \(6, 10\), expected shape \(\*batch, 19\)"):
         previewed().predicted(torch.ones(6, N_P))
-
-
-def test_invalid_parameters_are_named():
-    mpc = random_mpc(0)
-    with torch.no_grad():
-        mpc.C[0, 0] = torch.nan
-    with pytest.raises(QPError, match=r"3 of 3 .* 3 INVALID_DATA, .*: NaN or inf in the data"):
-        mpc.value(torch.zeros(3, 2))

@@ -29,16 +29,6 @@ def test_binaries_are_whole_and_relaxed_ones_are_not():
     assert program.maximise(objective, relaxed=True).bound == pytest.approx(11.0)
 
 
-def test_affine_functions_add_and_have_constants():
-    program = Program()
-    x = program.add(np.array([0.0]), np.array([2.0]))
-    y = program.add(np.array([-1.0]), np.array([1.0]))
-    total = (x + y.times(-np.eye(1))).plus(np.array([10.0]))
-    best = program.maximise(total)
-    assert best.value == pytest.approx(13)
-    assert total.at(best.x) == pytest.approx([13])
-
-
 def test_a_program_that_presolve_spoils_is_solved_without_it(monkeypatch):
     unknown = OptimizeResult(status=4, fun=0.0, message="model_status is Unknown")
     solve, presolved = module.milp, []
@@ -54,14 +44,6 @@ def test_a_program_that_presolve_spoils_is_solved_without_it(monkeypatch):
     monkeypatch.setattr(module, "milp", lambda *arguments, **others: unknown)
     with pytest.raises(SolverError, match="model_status is Unknown"):
         program.maximise(objective)
-
-
-def test_a_copy_grows_apart():
-    program, objective = knapsack()
-    other = program.copy()
-    other.constrain(objective, upper=5.0)
-    assert other.maximise(objective).value == pytest.approx(5)
-    assert program.maximise(objective).value == pytest.approx(11)
 
 
 def test_an_infeasible_program_is_an_error():

@@ -43,14 +43,6 @@ def test_without_the_compiler_the_import_ends_in_a_sentence(monkeypatch):
         runpy.run_path(linalg.__file__)
 
 
-@pytest.mark.parametrize("n", range(10))
-def test_a_product_takes_every_row(n):
-    x, factors, matrix = normal(5).numpy(), normal(n).numpy(), normal(n, 5, seed=1).numpy()
-    expected = x + matrix.T @ factors
-    linalg.add_product(x, factors, matrix)
-    np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)
-
-
 @pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (1, 6), (0, 3), (3, 0)])
 @pytest.mark.parametrize("M", [1, 3])
 def test_products_are_those_of_each_matrix(M, i, j):
@@ -68,13 +60,6 @@ def test_more_than_one_thread_would_take_is_multiplied_in_parts():
     assert matrix.size > linalg.ONE_THREAD // 5
     found = products(matrix, np.zeros(5, np.int64), vectors, NONE)
     np.testing.assert_allclose(found, vectors @ matrix[0].T, atol=1e-11)
-
-
-def test_a_diagonal_matrix_is_multiplied_as_such():
-    matrix, vectors = np.diag(np.arange(4.0))[None], normal(3, 4).numpy()
-    for product in (products, transposed_products):
-        found = product(matrix, np.zeros(3, np.int64), vectors, linalg.row_spans(matrix))
-        np.testing.assert_array_equal(found, vectors * np.arange(4.0))
 
 
 def test_spans_hold_all_nonzero_entries_of_a_single_matrix():

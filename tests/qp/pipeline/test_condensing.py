@@ -17,10 +17,8 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Elimination,
     Reduced,
     condense,
-    eliminate,
     in_order,
     inverse_factors,
-    null_space,
     sensitivities,
     sizes,
 )
@@ -109,24 +107,6 @@ def test_a_row_of_any_scale_counts():
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("M", [1, 2])
-@pytest.mark.parametrize("name", ["independent", "dependent", "zero", "none"])
-@pytest.mark.parametrize("eliminate", [null_space, in_order])
-def test_other_eliminations_solve_the_same_equations(eliminate, name, M):
-    C = (REGULAR | DEFICIENT)[name].expand(M, -1, -1).clone()
-    found = eliminate(C.numpy(), 3)
-    if eliminate is in_order and name != "independent":
-        assert found is None
-        return
-    T, Y_neg = torch.from_numpy(found.T), torch.from_numpy(found.Y_neg)
-    assert_close(C @ T[:, :, 3:], torch.zeros_like(C @ T[:, :, 3:]))
-    if name == "independent":
-        b = C @ normal(8, 1, seed=7)
-        assert_close(-C @ Y_neg @ b, b)
-        assert_close(C @ T, torch.zeros_like(C @ T))
-    assert_close(T[:, :3, :3], torch.eye(3).double().expand(M, 3, 3))
-
-
 def recursion(A: Tensor, B: Tensor, horizon: int) -> Elimination | None:
     return in_order(banded_matrix(A, B, horizon)[None].numpy(), len(A))
 
@@ -166,35 +146,6 @@ def test_sensitivities_solve_the_unconstrained_qp(r):
         assert_close(-g @ to_g[m] - lam @ to_lam[m], torch.cat((v, G[m] @ v)))
     singular = reduced._replace(H=np.zeros((2, 5, 5)))
     assert np.isnan(sensitivities(singular).to_g).all()
-
-
-@pytest.mark.parametrize("n_g", [0, 4, 8])
-@pytest.mark.parametrize("n_c", [0, 1, 3, 5])
-@pytest.mark.parametrize("M", [1, 4])
-def test_a_theta_is_condensed(M, n_c, n_g):
-    H, C, G = (normal(M, n, 8, seed=n) for n in (8, n_c, n_g))
-    theta = [theta_of(x, C, G) for x in (H + H.mT, H @ H.mT)]
-    C, G = C.numpy(), G.numpy()
-    T, Y_neg, padding = eliminate(C, 3)
-    assert padding is None
-    assert T.shape == (M, 8, 8 - n_c)
-    np.testing.assert_allclose(C @ T, 0, atol=1e-10)
-    np.testing.assert_allclose(-C @ Y_neg, np.eye(n_c) + np.zeros((M, 1, 1)), atol=1e-10)
-    np.testing.assert_allclose(T[:, :3, :3], np.eye(3) + np.zeros((M, 1, 1)))
-    for data, convex in zip(theta, (False, True), strict=True):
-        matrix, condensed = data.H, condense(data, 3)
-        _, _, H_y, G_y, H_b, G_b = condensed.arrays
-        assert condensed.surely_convex == convex
-        T_T = T.swapaxes(1, 2)
-        np.testing.assert_allclose(H_y, T_T @ matrix @ T, atol=1e-9)
-        np.testing.assert_allclose(H_b, -T_T @ matrix @ Y_neg, atol=1e-9)
-        np.testing.assert_allclose(G_y, G @ T, atol=1e-9)
-        np.testing.assert_allclose(G_b, -G @ Y_neg, atol=1e-9)
-
-
-def test_no_theta_at_all_is_condensed():
-    theta = theta_of(*(torch.zeros(0, n, 8).double() for n in (8, 3, 4)))
-    assert condense(theta, 2).surely_convex
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])

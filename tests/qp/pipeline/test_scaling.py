@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +9,8 @@ from torch.testing import assert_close
 
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of
-from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc import QPMPC, SolveLog, Status, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.scaling import finite_sizes
-from torch_qpmpc.qp.pipeline.solve import solve_programs
 
 BATCH = 4
 
@@ -78,39 +75,6 @@ def test_a_hard_bound_holds_where_states_are_large_and_actions_small(solver):
     assert_close(mpc.value(s), torch.tensor(3.04986581e8).double(), rtol=1e-6, atol=0)
 
 
-def test_solutions_come_back_in_the_numbers_of_the_qp():
-    known = in_size(known_qp(1, batch=(BATCH,)), cost=1e-7, rows=1e6)
-    raw = solve_programs(programs_of(known, None), "torch")
-    assert (raw.status == Status.SOLVED).all()
-    for name in ("value", "z", "chi", "lam", "xi"):
-        expected = getattr(known, name)
-        atol = 1e-9 * expected.abs().max()
-        assert_close(torch.from_numpy(getattr(raw, name)), expected, rtol=1e-6, atol=atol)
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-@pytest.mark.parametrize("spoilt", [torch.nan, torch.inf])
-def test_non_finite_qps_get_their_own_status(matrices, spoilt):
-    known = in_size(known_qp(2, batch=(BATCH,), matrices=matrices), cost=1e-7)
-    q = known.qp.q.clone()
-    q[1] = spoilt
-    tensors: dict[str, Any] = vars(known.qp) | {"q": q}
-    qp = QuadraticProgram(**tensors, check_values=False)
-    solution = solve_qp(qp, known.fixed, on_failure="mask")
-    assert solution.status.tolist() == [0, Status.INVALID_DATA, 0, 0]
-    assert_close(solution.value[[0, 2, 3]], known.value[[0, 2, 3]], rtol=1e-5, atol=1e-12)
-
-
-@pytest.mark.parametrize("size", [1e-8, 1e8])
-def test_small_and_large_contradictions_are_infeasible(size):
-    known = known_qp(3, batch=(BATCH,), n_c=1)
-    C, b = known.qp.C.repeat(2, 1), torch.cat((known.qp.b, known.qp.b + 1), -1)
-    twice = replace(known, qp=replace(known.qp, C=C, b=b), chi=torch.zeros_like(b))
-    small = in_size(twice, equalities=size, variables=size)
-    solution = solve_qp(small.qp, small.fixed, on_failure="mask")
-    assert (solution.status == Status.INFEASIBLE).all()
-
-
 def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     """One of three QPs with too large units has NaN in its matrices."""
     options = {"stage_weight": [1.0, 0.1, 0.01], "action_bounds": ([-1.0], [1.0])}
@@ -124,19 +88,3 @@ def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     solution = solve_qp(three, s, solver=solver, on_failure="mask")
     assert solution.status.tolist() == [0, Status.INVALID_DATA, 0]
     assert_close(solution.value[[0, 2]], torch.tensor([2.28345503, 0.05404678]).double())
-
-
-def test_a_batch_of_invalid_qps_in_unusual_units_is_invalid():
-    known = known_qp(0, batch=(2,))
-    C = 1e8 * known.qp.C
-    C[..., 0, -1] = torch.nan
-    qp = replace(known.qp, C=C, check_values=False)
-    status = solve_qp(qp, known.fixed, on_failure="mask").status
-    assert (status == Status.INVALID_DATA).all()
-
-
-def test_finite_sizes_are_the_largest_of_the_qps_that_share_a_matrix():
-    vectors = np.array([[1.0, -np.inf], [-3.0, np.nan], [2.0, 5.0]])
-    sizes = finite_sizes(vectors, np.array([1, 1, 0]), 2)
-    np.testing.assert_array_equal(sizes, [[2.0, 5.0], [3.0, 0.0]])
-    np.testing.assert_array_equal(finite_sizes(vectors[2:], np.zeros(9, int), 2), [[2, 5]] * 2)

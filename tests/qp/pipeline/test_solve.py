@@ -234,16 +234,6 @@ def test_a_cost_that_is_not_convex_has_no_solution_at_rest():
     assert at_rest(known).solve(nan).status[0] == Status.INVALID_DATA
 
 
-def test_threads_share_a_theta_at_rest():
-    known = shared(3)
-    rest, expected = at_rest(known), one_by_one(known, at_rest(known))
-    with ThreadPoolExecutor(4) as pool:
-        results = [*pool.map(lambda _: one_by_one(known, rest), range(8))]
-    for answers in results:
-        for one, other in zip(answers, expected, strict=True):
-            assert_close(one.z, other.z, rtol=1e-9, atol=1e-9)
-
-
 def test_a_solver_does_not_get_its_failures_again(monkeypatch, asked):
     recorder = BACKENDS["recorder"]
     monkeypatch.setitem(BACKENDS, "liar", lambda qps: LIES["v off"](recorder(qps)))
@@ -380,37 +370,6 @@ def test_rows_without_a_bound_or_a_free_variable_are_left_out(asked):
     known = known_qp(6, soft=("free", "inside", "above"), hard=("at_upper",))
     assert_right(solve(known, solver="recorder"), known)
     assert [qps.l.shape for qps in asked] == [(1, 3)]
-
-
-@pytest.mark.parametrize(("s", "kind"), [(0.5, "inside"), (1.5, "above"), (-3.0, "below")])
-def test_rows_of_fixed_entries_are_charged_in_closed_form(s, kind):
-    # min 1/2 (x^2 + u^2) + 7 dist(x, [-1, 1]) + u, with x fixed.
-    unit, none = torch.eye(2).double(), torch.zeros(0).double()
-    bound, w = torch.ones(2).double(), torch.tensor([7.0, torch.inf]).double()
-    q = torch.tensor([0.0, 1.0]).double()
-    C = none.reshape(0, 2)
-    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, -2 * bound, bound, w)
-    solution = solve_qp(qp, torch.tensor([s]).double(), solver="daqp")
-    sigma = {"inside": 0.0, "above": s - 1, "below": -2 - s}[kind]
-    lam = {"inside": 0.0, "above": 7.0, "below": -7.0}[kind]
-    assert_close(solution.value.item(), 0.5 * s**2 + 7 * sigma - 0.5)
-    assert_close(solution.sigma.tolist(), [sigma, 0.0])
-    assert_close((solution.eta - solution.upsilon).tolist(), [lam, 0.0])
-    assert_close(solution.xi.item(), -s - lam)
-
-
-@pytest.mark.parametrize("w", [torch.inf, 10.0], ids=["hard", "soft"])
-@pytest.mark.parametrize("side", [-1.0, 1.0], ids=["lower", "upper"])
-def test_a_bound_on_one_side_is_a_bound(side, w):
-    # min 1/2 (z - 3 side)^2 with z <= 1, or z >= -1.
-    unit, none = torch.ones(1, 1).double(), torch.zeros(0).double()
-    lb, ub = torch.tensor([[-torch.inf], [1.0]] if side > 0 else [[-1.0], [torch.inf]]).double()
-    weight = torch.tensor([w]).double()
-    q, C = -3 * side * unit[0], none.reshape(0, 1)
-    qp = QuadraticProgram(unit, q, none.sum(), C, none, unit, lb, ub, weight)
-    solution = solve_qp(qp, none, solver="daqp")
-    assert_close(solution.z.item(), side)
-    assert_close((solution.eta - solution.upsilon).item(), 2 * side)
 
 
 def test_invalid_elements_reach_no_backend(asked):

@@ -112,13 +112,3 @@ def test_active_sets_of_another_theta_lead_to_the_same_values(solver, size):
     assert log.fallback == 0
     if size < 1e-3:
         assert log.recalled > 0.9 * log.solves
-
-
-def test_without_a_known_set_the_values_are_the_same(solver):
-    mpc, s = random_mpc(10, solver=solver), random_states(64)
-    start = torch.full((64, mpc.n_z), UNKNOWN, dtype=torch.int8)
-    with SolveLog() as log:
-        warm = mpc.solve(s, warm_start=start)
-    assert_close(warm.value, mpc.value(s), rtol=1e-6, atol=1e-6)
-    assert log.fallback == 0
-    assert 32 < log.recalled < 64

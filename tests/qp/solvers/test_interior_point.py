@@ -9,10 +9,9 @@ from numpy.testing import assert_allclose
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, soft_qps
+from tests.problems import known_qp, soft_qps
 from torch_qpmpc import QPMPC, SolveLog
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs
-from torch_qpmpc.qp.solution import row_states
 from torch_qpmpc.qp.solvers import BackendSolution, interior_point
 from torch_qpmpc.qp.solvers.interior_point import SETTLED, BatchedQPs, settle
 
@@ -87,14 +86,6 @@ def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
     assert (difference <= reference.residual.clamp(min=1e-8)).all()
 
 
-def test_actions_at_their_bounds_are_no_harder():
-    mpc = paper_mpc()
-    s, a = paper_inputs()
-    solution = mpc.solve(s, a.sign())
-    assert solution.residual.max() <= 1e-9
-    assert (mpc.action_value(s, a.sign()) >= mpc.value(s) - 1e-9).all()
-
-
 def test_multipliers_of_inactive_rows_are_zero():
     solution = paper_mpc().solve(paper_inputs()[0])
     lam = solution.eta - solution.upsilon
@@ -113,9 +104,6 @@ def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
     return BatchedQPs.of(qps).residual(answer.v, answer.lam)
 
 
-SINGLE_KINDS = [((kind,), ()) for kind in SOFT_ROWS] + [((), (kind,)) for kind in HARD_ROWS]
-
-
 @pytest.mark.parametrize("count", [1, 7])
 @pytest.mark.parametrize("matrices", [False, True])
 @pytest.mark.parametrize("weight", [1e-2, 1.0, 1e4])
@@ -127,15 +115,6 @@ def test_rows_of_all_kinds_at_once(count, matrices, weight):
     answer = interior_point.solve(qps)
     assert_allclose(answer.v, exact.v, atol=1e-8)
     assert_allclose(answer.lam, exact.lam, atol=1e-8 * max(weight, 1.0))
-
-
-@pytest.mark.parametrize(("soft", "hard"), SINGLE_KINDS, ids=str)
-def test_rows_of_one_kind(soft, hard):
-    qps, exact = soft_qps(known_qp(2, batch=(5,), soft=soft, hard=hard))
-    if qps.l.shape[1]:
-        answer = interior_point.solve(qps)
-        assert_allclose(answer.v, exact.v, atol=1e-9)
-        assert_allclose(answer.lam, exact.lam, atol=1e-9)
 
 
 def as_tensors(**arrays: np.ndarray) -> SoftQPs:
@@ -175,25 +154,6 @@ def test_vertices_dependent_rows_and_flat_costs(d, rank):
         answer = interior_point.solve(qps)
         assert residual(qps, answer).max() <= SETTLED
         assert answer.iterations.max() <= 40
-
-
-def test_matrices_of_each_group_are_used():
-    several = [random_qps(seed, count=4, twice=False) for seed in range(3)]
-    order = np.array([2, 0, 1, 0, 2, 2, 1, 1, 0, 0, 1, 2])
-    place = np.array([order[:i].tolist().count(m) for i, m in enumerate(order)])
-    vectors = {
-        name: torch.stack([getattr(several[m], name)[i] for m, i in zip(order, place, strict=True)])
-        for name in ("g", "l", "u", "w")
-    }
-    mixed = SoftQPs(
-        H=torch.cat([qps.H for qps in several]),
-        G=torch.cat([qps.G for qps in several]),
-        group=torch.from_numpy(order),
-        **vectors,
-    )
-    answer = interior_point.solve(mixed)
-    for m, qps in enumerate(several):
-        assert_allclose(answer.v.numpy()[order == m], interior_point.solve(qps).v, atol=1e-8)
 
 
 # Degenerate shapes
@@ -285,30 +245,6 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
     assert residual(qps, answer).min() > 1e-3
 
 
-def test_nan_in_the_data_ends_in_a_finite_answer():
-    answer = interior_point.solve(one_row(g=np.full((3, 2), np.nan)))
-    assert answer.v.isfinite().all()
-    assert answer.lam.isfinite().all()
-
-
-def test_unsolvable_neighbours_do_no_harm():
-    good = random_qps(5)
-    lower, upper, w = good.l.clone(), good.u.clone(), good.w.clone()
-    w[:, [0, 6]] = torch.inf  # the same row twice, ..
-    lower[:, 6], upper[:, 6] = upper[:, 0] + 1, upper[:, 0] + 2  # .. with bounds far apart
-    both = good._replace(
-        group=torch.zeros(32, dtype=torch.int64),
-        **{
-            name: torch.stack([getattr(good, name), bad], 1).reshape(32, -1)
-            for name, bad in (("g", good.g), ("l", lower), ("u", upper), ("w", w))
-        },
-    )
-    answer = interior_point.solve(both)
-    assert_allclose(answer.v[::2], interior_point.solve(good).v, atol=1e-7)
-    assert residual(both, answer)[::2].max() <= SETTLED
-    assert residual(both, answer)[1::2].min() > 1e-3
-
-
 # Its active-set steps
 
 
@@ -321,23 +257,6 @@ def test_settling_keeps_the_better_solution():
         found = settle(form, near, lam, 2)
         assert (found.residual <= form.residual(near, lam)).all()
         assert_close(found.residual, form.residual(found.v, found.lam), rtol=0, atol=1e-15)
-
-
-def test_states_of_rows_are_the_same_for_arrays_and_tensors():
-    p = np.array([0.0, 1.5, 4.0, -1.5, -4.0, 2.0, 1.0, 9.0, 1.0])
-    lower = np.array([-1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, -np.inf, -np.inf])
-    upper = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
-    w = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, np.inf, np.inf])
-    bound, active, held = row_states(p, lower, upper, w)
-    assert active.tolist() == [False, True, False, True, False, True, True, True, False]
-    assert bound[active].tolist() == [1, -1, 1, 1, 1]
-    assert held[~active].tolist() == [0, 2, -2, 0]
-    for array, tensor in zip(
-        (bound, active, held),
-        row_states(*(torch.from_numpy(x) for x in (p, lower, upper, w))),
-        strict=True,
-    ):
-        assert_allclose(tensor.numpy(), array, rtol=0, atol=0)
 
 
 # One code for all devices
@@ -357,13 +276,3 @@ def test_the_core_stays_on_its_device_in_float64(device):
     # Nearly parallel rows determine only the sum of their forces.
     forces = (torch.einsum("brd,br->bd", qps.G[qps.group], x) for x in (lam.cpu(), expected.lam))
     assert_allclose(*forces, rtol=1e-7, atol=1e-6)
-
-
-def test_gradients_are_not_recorded():
-    qps = random_qps(11, count=2)
-    for tensor in qps:
-        if tensor.is_floating_point():
-            tensor.requires_grad_()
-    answer = interior_point.solve(qps)
-    assert not answer.v.requires_grad
-    assert not answer.lam.requires_grad
