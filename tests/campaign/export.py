@@ -17,7 +17,7 @@ import numpy as np
 
 from tests.campaign.exports import PROBLEMS
 from torch_qpmpc import export_c
-from torch_qpmpc.export.comparison import reference
+from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.qp.program import Status as Outcome
 from torch_qpmpc.study.markdown import replaced, table
@@ -72,7 +72,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
         again = [library.steps(warm, x[None], mpc.n_u) for x in part]
         exact = reference(mpc, part, "torch")
         for steps in (cold, type(cold)(*map(np.concatenate, zip(*again, strict=True)))):
-            u, value = differences(steps, exact)
+            u, value = differences(steps, exact, actions(mpc, exact))
             solved = (steps.codes == 0) & (exact.status == Outcome.SOLVED)
             worst = np.maximum(worst, [u[solved].max(initial=0), value[solved].max(initial=0)])
             infeasible = (steps.codes == 2) & (exact.status == Outcome.INFEASIBLE)
@@ -85,9 +85,9 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
     return row, not wrong and bool((worst <= LARGEST).all())
 
 
-def differences(steps, exact) -> tuple[np.ndarray, np.ndarray]:
+def differences(steps, exact, actions) -> tuple[np.ndarray, np.ndarray]:
     """Return the differences of u and of the value."""
-    u = np.abs(steps.u - exact.u).max(-1)
+    u = np.abs(steps.u - actions).max(-1)
     return u, np.abs(steps.value - exact.value) / (1 + np.abs(exact.value))
 
 

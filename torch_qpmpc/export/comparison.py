@@ -1,20 +1,14 @@
 """An exported policy beside an exact solver: random states of every kind, solutions, differences.
 
-A certified solution gives the active set; for a fixed one, the KKT conditions of the whole plan are
-linear equations. Their solution, with iterative refinement, is exact up to rounding if it confirms
-the active set, and else corrects it. Where this does not settle, the interior point is the most
-accurate solver.
+Where policy and solver differ, the solution is refined in twice the working precision.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
 
 import numpy as np
-import scipy
 import torch
 
 from torch_qpmpc.errors import QPError
@@ -22,19 +16,17 @@ from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import Array, Tables
 from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.solution import row_states
-from torch_qpmpc.qp.solve import solve_qp
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.refinement import refine
+from torch_qpmpc.qp.pipeline.solve import solve_programs
+from torch_qpmpc.qp.program import Status
 
 #: Number of random states that the compiled policy is compared at; at least `LEAST` for a `LARGE`
 #: QP, whose cold solves take long.
 COMPARED, LEAST = 400, 40
 #: QPs of more rows are solved by the interior point alone.
 LARGE = 200
-#: Most steps from one active set to the next.
-MAX_STEPS = 20
-#: A correction is kept if the value changes by no more than this fraction.
-CERTIFIED = 1e-5
 #: Differences above this, relative to the largest action or value, are worth an exact solution.
 DOUBTFUL = 1e-9
 #: Examples of each kind.
@@ -70,130 +62,41 @@ class Agreement:
     iterations: int
 
 
-class Reference(NamedTuple):
-    """Solutions of V at B states.
-
-    Attributes:
-        status: `Status` of each, ``(B,)``.
-        u, value: the actions ``(B, n_u)`` and costs to go ``(B,)``, NaN where unsolved.
-        active: the active sets, as in `QPSolution`, ``(B, n_g)``.
-    """
-
-    status: Array
-    u: Array
-    value: Array
-    active: Array
-
-
 @torch.no_grad()
-def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> Reference:
+def programs(mpc: QPMPC, p: Array) -> Programs:
+    """Return V's QPs at p ``(B, n_p)``."""
+    return Programs.of(*mpc.quadratic_program().tensors(), torch.as_tensor(p))[0]
+
+
+def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> BatchSolution:
     """Return the certified solutions of V at p ``(B, n_p)`` by a solver of the package."""
-    qp = mpc.quadratic_program()
-    solver = solver or ("torch" if _is_large(qp) else "daqp")
-    fixed = torch.as_tensor(p, dtype=qp.q.dtype, device=qp.q.device)
-    solution = solve_qp(qp, fixed, solver=solver, on_failure="mask")
-    solved = (solution.status == Status.SOLVED).cpu().numpy()
-    u = solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u].double().cpu().numpy()
-    value = solution.value.double().cpu().numpy()
-    return Reference(
-        solution.status.cpu().numpy().copy(),
-        np.where(solved[:, None], u, np.nan),
-        np.where(solved, value, np.nan),
-        solution.active.cpu().numpy().copy(),
-    )
+    qps = programs(mpc, p)
+    return solve_programs(qps, solver or ("torch" if _is_large(qps) else "daqp"))
 
 
-def _is_large(qp: QuadraticProgram) -> bool:
+def actions(mpc: QPMPC, solution: BatchSolution) -> Array:
+    """Return u_0 of V's solutions, ``(B, n_u)``."""
+    return solution.z[:, mpc.n_p : mpc.n_p + mpc.n_u]
+
+
+def _is_large(qps: Programs) -> bool:
     """Return True for more than `LARGE` rows with a bound."""
-    return int((qp.lb.isfinite() | qp.ub.isfinite()).sum()) > LARGE
+    lb, ub = qps.theta.lb, qps.theta.ub
+    return int((np.isfinite(lb) | np.isfinite(ub)).any(0).sum()) > LARGE
 
 
-def sharpen(mpc: QPMPC, p: Array, coarse: Reference, which: Array) -> Reference:
-    """Replace solutions of ``coarse`` at the indices ``which`` by exact ones."""
-    qp = mpc.quadratic_program()
-    if _is_large(qp):
-        return coarse
-    data = [x.detach().double().cpu().numpy() for x in qp.tensors()]
-    u, value = coarse.u.copy(), coarse.value.copy()
-    for i in which:
-        z = _exact(data, np.asarray(p[i], dtype=np.float64), coarse.active[i])
-        if z is None:
-            other = reference(mpc, p[i : i + 1], "torch")
-            if other.status[0] == Status.SOLVED:
-                u[i], value[i] = other.u[0], other.value[0]
-            continue
-        cost = _cost(data, z)
-        if abs(cost - value[i]) <= CERTIFIED * (1 + abs(value[i])):
-            u[i], value[i] = z[mpc.n_p : mpc.n_p + mpc.n_u], cost
-    return coarse._replace(u=u, value=value)
+def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
+    """Refine the solutions of ``coarse`` at the indices ``which``."""
+    qps, exact = programs(mpc, p), coarse.at(np.arange(len(p)))
+    if len(which) and not _is_large(qps):
+        refine(qps, exact, which, last=True)
+    return exact
 
 
-def _exact(data: list[Array], p: Array, active: Array) -> Array | None:
-    """Return the z that the KKT conditions of an active set give, None if it does not settle."""
-    H, q, _, C, b, G, lb, ub, w = data
-    n_p, n_c = len(p), len(C)
-    n = H.shape[0] - n_p
-    held = (np.abs(active) == 1) | ((lb == ub) & (np.abs(active) < 2))
-    level = np.where(active > 0, ub, lb)
-    fixed = np.where(np.abs(active) == 2, np.sign(active) * np.where(np.isinf(w), 0, w), 0.0)
-    held &= np.abs(G[:, n_p:]).max(-1) > 0
-    previous = None
-    for _ in range(MAX_STEPS):
-        A = G[held, n_p:]
-        B = np.concatenate((C[:, n_p:], A))
-        kkt = np.block([[H[n_p:, n_p:], B.T], [B, np.zeros((len(B), len(B)))]])
-        right = np.concatenate(
-            (
-                -q[n_p:] - H[n_p:, :n_p] @ p - G[:, n_p:].T @ fixed,
-                b - C[:, :n_p] @ p,
-                level[held] - G[held, :n_p] @ p,
-            )
-        )
-        x = _solve(kkt, right)
-        z = np.concatenate((p, x[:n]))
-        lam = fixed.copy()
-        lam[held] = x[n + n_c :]
-        level, held, fixed = row_states(G @ z + lam, lb, ub, w)
-        held &= np.abs(G[:, n_p:]).max(-1) > 0
-        fixed = np.where(held, 0.0, fixed)
-        fixed[~(np.abs(G[:, n_p:]).max(-1) > 0)] = 0.0
-        states = held, np.where(held, level, 0), fixed
-        if previous is not None and all(map(np.array_equal, states, previous)):
-            return z
-        previous = states
-    return None
-
-
-def _solve(matrix: Array, right: Array) -> Array:
-    """Solve a linear system with two refinements, by least squares if it is singular."""
-    lu, pivots, _ = scipy.linalg.lapack.dgetrf(matrix)
-
-    def regular(right: Array) -> Array:
-        return scipy.linalg.lapack.dgetrs(lu, pivots, right)[0]
-
-    x, solve = regular(right), regular
-    with np.errstate(all="ignore"):  # of a singular matrix
-        error = np.abs(matrix @ x - right).max()
-    if not error <= 1e-8 * (1 + np.abs(right).max()):
-        inverse = np.linalg.pinv(matrix, rcond=1e-13, hermitian=True)
-        x, solve = inverse @ right, partial(np.matmul, inverse)
-    wide = matrix.astype(np.longdouble)
-    for _ in range(2):
-        x = x + solve((right - wide @ x).astype(np.float64))
-    return x
-
-
-def _cost(data: list[Array], z: Array) -> float:
-    H, q, c, _, _, G, lb, ub, w = data
-    z, y = z.astype(np.longdouble), G @ z
-    off = np.maximum(np.maximum(lb - y, y - ub), 0)
-    return float(z @ (H @ z) / 2 + q @ z + c + np.where(np.isinf(w), 0, w) @ off)
-
-
-def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, Reference]:
+def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution]:
     """Draw states in the policy's numbers, most of which have solutions, and solve for them."""
 
-    def solve(p: Array) -> Reference:
+    def solve(p: Array) -> BatchSolution:
         return reference(mpc, p.astype(dtype).astype(np.float64))
 
     count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2)
@@ -235,8 +138,8 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
 
 
 def nearer(
-    tables: Tables, p: Array, solve: Callable[[Array], Reference]
-) -> tuple[Array, Reference]:
+    tables: Tables, p: Array, solve: Callable[[Array], BatchSolution]
+) -> tuple[Array, BatchSolution]:
     """Draw infeasible p nearer to the centre until they have solutions, and solve for all p.
 
     The p with a plan are a convex set. One infeasible p in four stays what it is.
@@ -248,13 +151,11 @@ def nearer(
         if not len(moved):
             break
         p[moved] = (p[moved] + tables.centre) / 2
-        solution = solve(p[moved])
-        for whole, part in zip(exact, solution, strict=True):
-            whole[moved] = part
+        exact.put(moved, solve(p[moved]))
     return p, exact
 
 
-def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference]:
+def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, BatchSolution]:
     """Choose a few states of each kind, and return exact solutions of them.
 
     Raises:
@@ -269,7 +170,6 @@ def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference
     }
     chosen = {kind: np.flatnonzero(mask)[:EACH] for kind, mask in kinds.items()}
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
-    codes = {"infeasible": 2}
     if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
         remedy = (
@@ -278,12 +178,13 @@ def choose(mpc: QPMPC, p: Array, coarse: Reference) -> tuple[Examples, Reference
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
     H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
     terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
+    u, value = actions(mpc, exact), np.where(solved, exact.value, 0.0)
     examples = [
-        Example(kind, p[i], codes.get(kind, 0), exact.u[i], float(exact.value[i]), float(terms[i]))
+        Example(kind, p[i], 0 if solved[i] else INFEASIBLE, u[i], float(value[i]), float(terms[i]))
         for kind, indices in chosen.items()
         for i in indices
     ]
-    return Examples(examples, _size(exact.u, solved), float(_size(exact.value, solved))), exact
+    return Examples(examples, _size(u, solved), float(_size(value, solved))), exact
 
 
 def _size(x: Array, solved: Array) -> Array:
@@ -292,7 +193,7 @@ def _size(x: Array, solved: Array) -> Array:
 
 
 def compare(
-    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: Reference
+    mpc: QPMPC, tables: Tables, library: Library, p: Array, exact: BatchSolution
 ) -> tuple[Agreement, float]:
     """Return the agreement, and the largest error of an action relative to its size.
 
@@ -303,13 +204,14 @@ def compare(
     solvable = exact.status == Status.SOLVED
     both = solvable & (steps.codes == 0)
 
-    def differences(exact: Reference) -> tuple[Array, Array]:
-        u = np.abs(steps.u - exact.u).max(-1)
+    @np.errstate(invalid="ignore")  # a QP without a solution has an infinite value
+    def differences(exact: BatchSolution) -> tuple[Array, Array]:
+        u = np.abs(steps.u - actions(mpc, exact)).max(-1)
         return u, np.abs(steps.value - exact.value) / (np.abs(exact.value) + 1e-300)
 
     u, value = differences(exact)
     # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
-    sizes = np.abs(exact.u).max(-1)
+    sizes = np.abs(actions(mpc, exact)).max(-1)
     sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
     doubtful = both & ((u > DOUBTFUL * sizes) | (value > DOUBTFUL))
     if library.real == np.float64:

@@ -246,8 +246,8 @@ def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
     dtype, near, states = settings.dtype, NEAR[settings.dtype], examples.states
     arrays = {
         "EXAMPLE_P": np.array([e.p for e in states]).reshape(-1, tables.n_p),
-        "EXAMPLE_U": np.array([np.nan_to_num(e.u) for e in states]).reshape(-1, tables.n_u),
-        "EXAMPLE_VALUE": np.array([np.nan_to_num(e.value) for e in states]),
+        "EXAMPLE_U": np.array([e.u for e in states]).reshape(-1, tables.n_u),
+        "EXAMPLE_VALUE": np.array([e.value for e in states]),
         "NEAR_U": near.u * examples.u,
         "NEAR_VALUE": near.value * np.fmax([abs(e.value) for e in states], examples.value)
         + ROUNDING * np.finfo(dtype).eps * np.array([e.terms for e in states]),
