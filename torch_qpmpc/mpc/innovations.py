@@ -55,23 +55,15 @@ class Innovations(NamedTuple):
         poles = np.linalg.eigvals(self.A)
         return poles[np.argsort(-np.abs(poles), kind="stable")]
 
-    def gain(self, P: Array, seen: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return L_k, the covariance of e_k and P_{k+1} from P_k.
-
-        Args:
-            P: ``(*batch, n, n)``.
-            seen: False for outputs that are not measured, ``(*batch, n_y)``.
-        """
-        C, L, S, seen = self.C, self.L, self.S, np.ones(len(self.C)) if seen is None else seen
+    def gain(self, P: Array) -> tuple[Array, Array, Array]:
+        """Return L_k, the covariance of e_k and P_{k+1} from P_k ``(n, n)``."""
+        C, L, S = self.C, self.L, self.S
         V = C @ P @ C.T + S
-        known = V * seen[..., None] * seen[..., None, :]
-        inverse = _inverse(known)
+        inverse = _inverse(V)
         # In directions without variance the steady gain holds.
-        gain = (P @ C.T + L @ S) @ inverse + L @ (
-            seen[..., None] * np.eye(len(C)) - known @ inverse
-        )
-        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.swapaxes(-1, -2)) @ self.A.T
-        return gain, V, (P + P.swapaxes(-1, -2)) / 2
+        gain = (P @ C.T + L @ S) @ inverse + L @ (np.eye(len(C)) - V @ inverse)
+        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.T) @ self.A.T
+        return gain, V, (P + P.T) / 2
 
     def settling(self, steps: int, settled: float = SETTLED) -> Iterator[tuple[Array, Array]]:
         """Yield the gains L_0, L_1, .. from P0 and their outputs' covariances, at most ``steps``.
@@ -94,21 +86,15 @@ class Innovations(NamedTuple):
         r"""Return \xi_0, .., \xi_T ``(*batch, T + 1, n)`` of trajectories of equal length.
 
         Args:
-            y: outputs ``(*batch, T + 1, n_y)``; an entry that is NaN was not measured.
+            y: outputs ``(*batch, T + 1, n_y)``.
             u: inputs ``(*batch, T, n_u)``.
             d: known signals ``(*batch, T, n_d)``.
         """
-        seen, inputs = np.isfinite(y), self.inputs(u, d)
-        whole = seen.all()
-        gains = self.gains(y.shape[-2]) if whole else ()
-        xi, P, x = np.empty((*y.shape[:-1], len(self.A))), self.P0, self.x0
+        inputs, gains = self.inputs(u, d), self.gains(y.shape[-2])
+        xi, x = np.empty((*y.shape[:-1], len(self.A))), self.x0
         for k in range(y.shape[-2]):
-            e = np.where(seen[..., k, :], y[..., k, :] - x @ self.C.T, 0.0)
-            if whole:
-                xi[..., k, :] = x + e @ (gains[k] if k < len(gains) else self.L).T
-            else:
-                gain, _, P = self.gain(P, seen[..., k, :])
-                xi[..., k, :] = x + (gain @ e[..., None])[..., 0]
+            e = y[..., k, :] - x @ self.C.T
+            xi[..., k, :] = x + e @ (gains[k] if k < len(gains) else self.L).T
             if k < inputs.shape[-2]:
                 x = xi[..., k, :] @ self.A.T + inputs[..., k, :]
         return xi
@@ -120,8 +106,7 @@ class Innovations(NamedTuple):
     def errors(self, y: Array, u: Array, d: Array, horizon: int) -> Array:
         """Return y_{k+h} minus its prediction from the estimate at k, in `estimates`' shapes.
 
-        It is NaN after the end of the trajectory, and where the output was not measured:
-        ``(*batch, T, horizon, n_y)``.
+        It is NaN after the end of the trajectory: ``(*batch, T, horizon, n_y)``.
         """
         steps, inputs = u.shape[-2], self.inputs(u, d)
         errors = np.full((*u.shape[:-1], horizon, len(self.C)), np.nan)
@@ -140,8 +125,8 @@ class Innovations(NamedTuple):
 
 
 def _inverse(V: Array) -> Array:
-    """Return the pseudoinverse of covariances, in unit variances."""
-    size = np.sqrt(np.maximum(np.diagonal(V, axis1=-2, axis2=-1), 0))
+    """Return the pseudoinverse of a covariance, in unit variances."""
+    size = np.sqrt(np.maximum(np.diagonal(V), 0))
     scale = np.divide(1, size, out=np.zeros_like(size), where=size > 0)
-    scale = scale[..., None] * scale[..., None, :]
+    scale = scale[:, None] * scale
     return scale * np.linalg.pinv(scale * V, SINGULAR, True)

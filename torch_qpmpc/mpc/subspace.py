@@ -105,7 +105,7 @@ def fit_state_space(
     orders that are nearly as good, the smallest.
 
     Args:
-        trajectories: the log; outputs that are NaN were not measured.
+        trajectories: the log.
         order: states of the likelihood's model; 0 for the outputs alone, each measured exactly.
             The innovations form has more if the outputs are not independent functions of them.
         lags: lags of the ARX model of the start.
@@ -153,13 +153,12 @@ def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
     errors = [e[:, :, 0] for e in _errors(model, trajectories, 1)]
     whole, inside = np.concatenate([e.reshape(-1, e.shape[-1]) for e in errors]), []
-    mean, variance = np.nanmean(whole, 0), np.nanvar(whole, 0)
+    mean, variance = whole.mean(0), whole.var(0)
     for lag in range(1, CORRELATIONS + 1):
         pairs = [(e[:, lag:] - mean) * (e[:, :-lag] - mean) for e in errors]
         pairs = np.concatenate([x.reshape(-1, x.shape[-1]) for x in pairs])
-        count = np.isfinite(pairs).sum(0)
-        size = variance * 1.96 * np.sqrt(np.maximum(count, 1))
-        inside.append(np.abs(np.nansum(pairs, 0)) <= size)
+        size = variance * 1.96 * np.sqrt(max(len(pairs), 1))
+        inside.append(np.abs(pairs.sum(0)) <= size)
     return np.mean(inside, 0)
 
 
@@ -171,15 +170,14 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
     """
     n_y, n_u = len(model.C), model.B.shape[1]
     parts = zip(_errors(model, trajectories, 1), _batches(_signals(trajectories)), strict=True)
-    pairs = (np.concatenate((e[:, :-1, 0], v[:, 1:, :n_u]), -1) for e, ((_, v), _) in parts)
+    pairs = (np.concatenate((e[:, :-1, 0], v[:, 1:, :n_u]), -1) for e, (_, v) in parts)
     rows = np.concatenate([x.reshape(-1, n_y + n_u) for x in pairs])
-    rows = rows[np.isfinite(rows).all(1)]
     if len(rows) <= n_u + 1:  # such as from trajectories of single steps
         return np.zeros(n_y)
     e, u = np.split(rows - rows.mean(0), [n_y], 1)
     left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
     before, after = (e**2).sum(0) / (len(rows) - 1), (left**2).sum(0) / (len(rows) - n_u - 1)
-    size = np.nanmax(np.abs(np.concatenate([one.y.numpy() for one in trajectories])), 0)
+    size = np.abs(np.concatenate([one.y.numpy() for one in trajectories])).max(0)
     noisy = before > (EXACT * size) ** 2
     return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
 
@@ -187,7 +185,7 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
     states = []
-    for (y, v), _ in _batches(_signals(trajectories)):
+    for y, v in _batches(_signals(trajectories)):
         u, d = np.split(v, [model.B.shape[1]], -1)
         x = model.estimates(y, u, d)[..., :-1, :] @ model.A.T + model.inputs(u, d)
         states.append(x.reshape(-1, len(model.A)))
@@ -204,7 +202,7 @@ def _errors(
 ) -> Iterator[Array]:
     """Yield multi-step errors ``(G, T, horizon, n_y)`` of the trajectories of each length."""
     n_u = model.B.shape[1]
-    for (y, v), _ in _batches(_signals(trajectories)):
+    for y, v in _batches(_signals(trajectories)):
         yield model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
 
 
@@ -249,7 +247,7 @@ def _score(models: list[Innovations], folds: list) -> float:
     """Return the mean logarithm of the squared errors of all horizons and outputs."""
     last, total, count = max(HORIZONS), np.zeros(()), np.zeros(())
     for model, (_, batches) in zip(models, folds, strict=True):
-        for (y, v), _ in batches:
+        for y, v in batches:
             errors = model.errors(y, v, v[..., :0], last)[..., np.array(HORIZONS) - 1, :]
             errors = errors.reshape(-1, *errors.shape[-2:])
             total = total + np.nansum(errors**2, 0)
@@ -274,7 +272,7 @@ class _Normal:
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
         self.apart, self.n_u = _unmoved(trajectories), trajectories[0].u.shape[1]
         y = np.concatenate([x.y.numpy() for x in trajectories])
-        held = [_filled(x.y.numpy()[:, self.apart]) for x in trajectories]
+        held = [x.y.numpy()[:, self.apart] for x in trajectories]
         self.first = np.array([x[0] for x in held])
         self.changes = np.concatenate([np.diff(x, axis=0) for x in held])
         self.y, self.y_size = _scale(y[:, ~self.apart])
@@ -282,14 +280,14 @@ class _Normal:
 
     def _known(self, one: Trajectory) -> Array:
         y, u, d = (x.numpy() for x in one)
-        return np.hstack((u, d, _filled(y[:, self.apart])[:-1]))
+        return np.hstack((u, d, y[:-1, self.apart]))
 
     def apply(self, trajectories: Sequence[Trajectory]) -> list[Signals]:
         """Return the signals."""
         data = []
         for one in trajectories:
             v = (self._known(one) - self.v) / self.v_size
-            y = (one.y.numpy()[:, ~self.apart] - self.y) / self.y_size
+            y = (one.y.numpy().compress(~self.apart, 1) - self.y) / self.y_size
             data.append(Signals(y, np.hstack((v, np.ones((len(v), 1))))))
         return data
 
@@ -342,7 +340,7 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     last inputs and their squares. An F-test of 1 % decides whether these explain them.
     """
     changes = np.concatenate([np.diff(x.y.numpy(), axis=0) for x in trajectories])
-    unmoved: Any = ~(np.abs(np.nan_to_num(changes)) > 0).any(0)
+    unmoved: Any = ~(changes != 0).any(0)
     seldom = np.flatnonzero(~unmoved & ((changes == 0).mean(0) >= CONSTANT))
     use = [x for x in trajectories if x.steps > LAST]
     if not len(seldom) or not use:
@@ -352,9 +350,8 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     U = np.hstack((np.ones((len(U), 1)), U, U**2))
     after = np.concatenate([np.diff(x.y.numpy()[LAST - 1 :, seldom], axis=0) for x in use])
     for i, target in zip(seldom, after.T, strict=True):
-        X, target = U[np.isfinite(target)], target[np.isfinite(target)]
-        rest = target - X @ np.linalg.lstsq(X, target, rcond=None)[0]
-        m, left = X.shape[1] - 1, len(X) - X.shape[1]
+        rest = target - U @ np.linalg.lstsq(U, target, rcond=None)[0]
+        m, left = U.shape[1] - 1, len(U) - U.shape[1]
         if left > 0:
             explained = ((target - target.mean()) ** 2).sum() - rest @ rest
             unmoved[i] = (
@@ -364,7 +361,7 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
 
 
 def _scale(x: Array) -> tuple[Array, Array]:
-    mean, size = np.nanmean(x, 0), np.nanstd(x, 0)
+    mean, size = x.mean(0), x.std(0)
     return mean, np.where(size > 1e-12 * np.abs(mean), size, 1.0)
 
 
@@ -376,12 +373,10 @@ def measured(data: Sequence[Signals]) -> Innovations:
     n = data[0].y.shape[1]
     X = np.concatenate([np.hstack((y[:-1], v)) for y, v in data])
     Y = np.concatenate([y[1:] for y, _ in data])
-    whole = np.isfinite(X).all(1) & np.isfinite(Y).all(1)
-    W = ridge(torch.as_tensor(X[whole]), torch.as_tensor(Y[whole])).numpy().T
-    e = Y[whole] - X[whole] @ W.T
+    W = ridge(torch.as_tensor(X), torch.as_tensor(Y)).numpy().T
+    e = Y - X @ W.T
     S, one, none = e.T @ e / len(e), np.eye(n), np.zeros((n, 0))
     first = np.array([y[0] for y, _ in data])
-    first = first[np.isfinite(first).all(1)]
     P0 = np.cov(first.T, bias=True).reshape(n, n) - S
     return Innovations(W[:, :n], W[:, n:], none, np.zeros(n), one, one, S, first.mean(0), P0)
 
@@ -400,9 +395,8 @@ class _Predictor(NamedTuple):
 def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
     """Fit an ARX model of ``lags`` and decompose its predictions of as many steps."""
     n_y = data[0].y.shape[1]
-    filled = [Signals(_filled(y), v) for y, v in data]
     windows, after = [], []
-    for y, v in filled:
+    for y, v in data:
         if len(v) >= lags:
             w = np.hstack((y[:-1], v[:, :-1]))
             count = len(w) - lags + 1
@@ -415,7 +409,7 @@ def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
         G[f * n_y : (f + 1) * n_y, f * q :] = W[: (lags - f) * q].T
     _, s, Vh = np.linalg.svd(np.linalg.qr(Z, mode="r") @ G.T, full_matrices=False)
     s = s[s > 1e-9 * s[0]] / np.sqrt(len(Z))
-    return _Predictor(windows, after, Vh, s, G, np.mean([y[0] for y, _ in filled], 0))
+    return _Predictor(windows, after, Vh, s, G, np.mean([y[0] for y, _ in data], 0))
 
 
 def _states(predictor: _Predictor, order: int) -> Noisy:
@@ -433,23 +427,11 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
     return Noisy(AB[:, :order], AB[:, order:], C, Q, R, np.linalg.pinv(C) @ first, np.eye(order))
 
 
-def _filled(y: Array) -> Array:
-    """Return y with missing entries interpolated in time."""
-    y, k = y.copy(), np.arange(len(y))
-    for column in y.T:
-        seen = np.isfinite(column)
-        column[~seen] = np.interp(k[~seen], k[seen], column[seen]) if seen.any() else 0.0
-    return y
-
-
 # Maximum likelihood
 
 
 class _Moments(NamedTuple):
-    """Smoothed means ``(G, T + 1, n)``, their covariances and those of neighbours.
-
-    Without missing samples all G trajectories have the same covariances, ``(T + 1, 1, n, n)``.
-    """
+    """Smoothed means ``(G, T + 1, n)``, their covariances ``(T + 1, n, n)`` and neighbours'."""
 
     x: Array
     P: Array
@@ -457,37 +439,34 @@ class _Moments(NamedTuple):
     likelihood: float
 
 
-def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
-    """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``; None if all is ``seen``."""
+def smooth(par: Noisy, y: Array, v: Array) -> _Moments:
+    """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``."""
     A, B, C, Q, R, m, P = par
     (G, N, n_y), n = y.shape, len(A)
-    there = np.ones((N, 1, n_y)) if seen is None else np.moveaxis(seen, 0, 1).astype(float)
-    g = there.shape[1]
-    before, after = np.empty((N, g, n, n)), np.empty((N, g, n, n))
-    L, inverse, half = np.empty((N, g, n, n_y)), np.empty((N, g, n_y, n_y)), np.empty((N, g))
+    before, after = np.empty((N, n, n)), np.empty((N, n, n))
+    L, inverse, half = np.empty((N, n, n_y)), np.empty((N, n_y, n_y)), np.empty(N)
     steady = N
     for t in range(N):
         before[t] = A @ after[t - 1] @ A.T + Q if t else P
         change = np.abs(before[t] - before[t - 1]).max()
-        if seen is None and t > 1 and change <= SAME * np.abs(before[t]).max():
+        if t > 1 and change <= SAME * np.abs(before[t]).max():
             for part in (before, after, L, inverse, half):
                 part[t:] = part[t - 1]
             steady = t
             break
-        Ct = C * there[t, :, :, None]
-        V = Ct @ before[t] @ Ct.swapaxes(-1, -2) + R
+        V = C @ before[t] @ C.T + R
         inverse[t], half[t] = np.linalg.inv(V), np.linalg.slogdet(V)[1]
-        L[t] = before[t] @ Ct.swapaxes(-1, -2) @ inverse[t]
-        P = before[t] - L[t] @ V @ L[t].swapaxes(-1, -2)
-        after[t] = (P + P.swapaxes(-1, -2)) / 2
-    L, y = L * there[..., None, :], np.moveaxis(y, 0, 1) * there
+        L[t] = before[t] @ C.T @ inverse[t]
+        P = before[t] - L[t] @ V @ L[t].T
+        after[t] = (P + P.T) / 2
+    y = np.moveaxis(y, 0, 1)
     moved = np.moveaxis(v @ B.T, 0, 1) + _apply(A @ L, y)[:-1]
     # Copies are contiguous, or the kernels would be compiled for each layout.
     start = np.broadcast_to(m, (G, n)).copy()
     prior = recursion((A - A @ L @ C)[:-1].copy(), moved.copy(), start)
-    e = (y - prior @ C.T) * there
+    e = y - prior @ C.T
     post = prior + _apply(L, e)
-    value = -(half.sum() * G / g + (_apply(inverse, e) * e).sum()) / 2
+    value = -(half.sum() * G + (_apply(inverse, e) * e).sum()) / 2
     J = np.linalg.solve(before[1 : steady + 1], A @ after[:steady][: N - 1]).swapaxes(-1, -2)
     J = J[np.arange(N - 1).clip(max=len(J) - 1)]
     back = (post[:-1] - _apply(J, prior[1:]))[::-1].copy()
@@ -498,15 +477,15 @@ def smooth(par: Noisy, y: Array, v: Array, seen: Array | None) -> _Moments:
 
 
 def _apply(M: Array, x: Array) -> Array:
-    """Return the products of x ``(T, G, n)`` with the matrices of each step ``(T, 1 or G, ..)``."""
-    return np.matmul(M, x[..., None])[..., 0]
+    """Return the products of x ``(T, G, n)`` with the matrices of each step ``(T, .., n)``."""
+    return np.matmul(M[:, None], x[..., None])[..., 0]
 
 
 @compiled
 def recursion(M, c, z):
-    """Return z_0 = z and z_{t+1} = M_t z_t + c_t ``(T + 1, G, n)``; M is ``(T, 1 or G, n, n)``."""
+    """Return z_0 = z and z_{t+1} = M_t z_t + c_t, ``(T + 1, G, n)``."""
     T, G, n = c.shape
-    g, out = M.shape[1], np.empty((T + 1, G, n))
+    out = np.empty((T + 1, G, n))
     for i in range(G):
         for j in range(n):
             out[0, i, j] = z[i, j]
@@ -515,45 +494,40 @@ def recursion(M, c, z):
             for j in range(n):
                 total = c[t, i, j]
                 for k in range(n):
-                    total += M[t, i % g, j, k] * out[t, i, k]
+                    total += M[t, j, k] * out[t, i, k]
                 out[t + 1, i, j] = total
     return out
 
 
 @compiled
 def spread(J, own, last):
-    """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, g, n, n)``."""
-    T, g, n, _ = own.shape
-    out, half = np.empty((T + 1, g, n, n)), np.empty((n, n))
-    for i in range(g):
+    """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, n, n)``."""
+    T, n, _ = own.shape
+    out, half = np.empty((T + 1, n, n)), np.empty((n, n))
+    for j in range(n):
+        for k in range(n):
+            out[T, j, k] = last[j, k]
+    for t in range(T - 1, -1, -1):
         for j in range(n):
             for k in range(n):
-                out[T, i, j, k] = last[i, j, k]
-        for t in range(T - 1, -1, -1):
-            for j in range(n):
-                for k in range(n):
-                    half[j, k] = 0.0
-                    for m in range(n):
-                        half[j, k] += J[t, i, j, m] * out[t + 1, i, m, k]
-            for j in range(n):
-                for k in range(n):
-                    total = own[t, i, j, k]
-                    for m in range(n):
-                        total += half[j, m] * J[t, i, k, m]
-                    out[t, i, j, k] = total
+                half[j, k] = 0.0
+                for m in range(n):
+                    half[j, k] += J[t, j, m] * out[t + 1, m, k]
+        for j in range(n):
+            for k in range(n):
+                total = own[t, j, k]
+                for m in range(n):
+                    total += half[j, m] * J[t, k, m]
+                out[t, j, k] = total
     return out
 
 
-def _batches(data: Sequence[Signals]) -> list[tuple[Signals, Array | None]]:
-    """Return trajectories of the same length together, and which samples are there if any lack."""
-    groups: dict[tuple[int, bool], list[Signals]] = defaultdict(list)
-    for y, v in data:
-        groups[len(v), bool(np.isnan(y).any())].append(Signals(y, v))
-    batches = []
-    for (_, missing), group in groups.items():
-        y, v = (np.stack(parts) for parts in zip(*group, strict=True))
-        batches.append((Signals(y, v), np.isfinite(y) if missing else None))
-    return batches
+def _batches(data: Sequence[Signals]) -> list[Signals]:
+    """Return trajectories of the same length together."""
+    groups: dict[int, list[Signals]] = defaultdict(list)
+    for one in data:
+        groups[len(one.v)].append(one)
+    return [Signals(*map(np.stack, zip(*group, strict=True))) for group in groups.values()]
 
 
 def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
@@ -561,42 +535,33 @@ def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
     batches, before = _batches(data), -np.inf
     steps = sum(len(y) for y, _ in data)
     for _ in range(iterations):
-        moments = [smooth(par, np.nan_to_num(y), v, seen) for (y, v), seen in batches]
+        moments = [smooth(par, y, v) for y, v in batches]
         value = sum(m.likelihood for m in moments) / steps
         if value - before < STALLED:
             break
-        before, par = value, _maximise(par, batches, moments, len(par.A))
+        before, par = value, _maximise(batches, moments)
     return par
 
 
-def _maximise(par: Noisy, batches: list, moments: list[_Moments], n: int) -> Noisy:
+def _maximise(batches: list[Signals], moments: list[_Moments]) -> Noisy:
     Szz: Any = 0.0
     Sx1 = S11 = Syx = Sxx = Syy = first = Szz
-    N = M = 0
-    for ((y, v), seen), (x, P, cross, _) in zip(batches, moments, strict=True):
-        G = len(y) / P.shape[1]
+    N, M, n = 0, 0, moments[0].x.shape[-1]
+    for (y, v), (x, P, cross, _) in zip(batches, moments, strict=True):
+        G = len(y)
         z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
         x1, all_x, ys = x[:, 1:].reshape(-1, n), x.reshape(-1, n), y.reshape(-1, y.shape[-1])
         zz, xz = z.T @ z, x1.T @ z
-        zz[:n, :n] += G * P[:-1].sum((0, 1))
-        xz[:, :n] += G * cross.sum((0, 1))
-        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum((0, 1))
-        if seen is not None:  # outputs that are missing have their expected moments
-            gone = ~np.moveaxis(seen, 0, 1)[..., None]
-            CP, both = par.C @ P, gone & gone.swapaxes(-1, -2)
-            Syx = Syx + (gone * CP).sum((0, 1))
-            Syy = Syy + (both * (CP @ par.C.T + par.R)).sum((0, 1))
-            ys = np.where(seen, y, x @ par.C.T).reshape(ys.shape)
-        Syx, Sxx, Syy = (
-            Syx + ys.T @ all_x,
-            Sxx + all_x.T @ all_x + G * P.sum((0, 1)),
-            Syy + ys.T @ ys,
-        )
+        zz[:n, :n] += G * P[:-1].sum(0)
+        xz[:, :n] += G * cross.sum(0)
+        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum(0)
+        Syx, Syy = Syx + ys.T @ all_x, Syy + ys.T @ ys
+        Sxx = Sxx + all_x.T @ all_x + G * P.sum(0)
         N, M = N + len(x1), M + len(ys)
     count = sum(len(m.x) for m in moments)
     m0: Any = sum(m.x[:, 0].sum(0) for m in moments) / count
     for m in moments:
-        first = first + (m.x[:, 0] - m0).T @ (m.x[:, 0] - m0) + len(m.x) * m.P[0].mean(0)
+        first = first + (m.x[:, 0] - m0).T @ (m.x[:, 0] - m0) + len(m.x) * m.P[0]
     P0 = first / count
     AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
     C = np.linalg.solve(_lifted(Sxx), Syx.T).T
@@ -635,7 +600,7 @@ def steady(par: Noisy) -> Innovations:
 def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
     """Return the model with the outputs as the first states, and others of unit variance."""
     n, C = len(model.A), model.C
-    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for (y, v), _ in _batches(data)]
+    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for y, v in _batches(data)]
     cov = np.cov(np.concatenate(xi).T, bias=True).reshape(n, n)
     root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(n))
     _, s, Vh = np.linalg.svd(C @ root)
