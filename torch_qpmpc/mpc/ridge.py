@@ -12,19 +12,13 @@ STRENGTHS = 10.0 ** torch.arange(-16, 4.1, 0.25, dtype=torch.float64)
 SHARE = 0.3
 
 
-def ridge(
-    X: Tensor,
-    Y: Tensor,
-    strength: float | None = None,
-    strengths: Tensor = STRENGTHS,
-    share: float = SHARE,
-) -> Tensor:
+def ridge(X: Tensor, Y: Tensor, strengths: Tensor = STRENGTHS, share: float = SHARE) -> Tensor:
     """Return the W that minimises ``|Y - X W|^2 / n + strength |D W|^2``, ``(m, n_y)``.
 
-    D holds the root mean squares of X's columns, so that W does not depend on their units. By
-    default the strength is ``share`` of the one with the largest evidence, the likelihood of Y
-    ``(n, n_y)`` under a Gaussian prior of W, for each column of Y by itself; the variance of the
-    noise has its likeliest value. X is ``(n, m)``, and the evidence decides among ``strengths``.
+    D holds the root mean squares of X's columns, so that W does not depend on their units. The
+    strength is ``share`` of the one with the largest evidence, the likelihood of Y ``(n, n_y)``
+    under a Gaussian prior of W, for each column of Y by itself; the variance of the noise has its
+    likeliest value. X is ``(n, m)``, and the evidence decides among ``strengths``.
     """
     n, m = X.shape
     size = X.square().mean(0).sqrt()
@@ -38,10 +32,7 @@ def ridge(
     U, s, Vh = torch.linalg.svd(basis, full_matrices=False)
     a = U.mT @ target
     outside = outside + (target - U @ a).square().sum(0)
-    if strength is None:
-        shrinkage = share * _best_strength(s, a, outside, n, strengths)
-    else:
-        shrinkage = torch.full_like(outside, strength)
+    shrinkage = share * _best_strength(s, a, outside, n, strengths)
     seen = (s > s.amax() * max(n, m) * torch.finfo(s.dtype).eps).unsqueeze(-1)
     s = s.unsqueeze(-1)
     inverse = torch.where(seen, s / (s.square() + n * shrinkage), 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -33,10 +32,10 @@ FLOOR, TOLERANCE, ITERATIONS = 1e-2, 1e-9, 500
 
 @dataclass(frozen=True, eq=False)
 class StageCost:
-    """``1/2 v'Wv + q'v + c`` of v = [d; x; u], which unpacks as W ``(n, n)``, q ``(n,)``, c ``()``.
+    """``1/2 v'Wv + q'v + c`` of v = [d; x; u].
 
     Attributes:
-        W, q, c: the cost.
+        W, q, c: ``(n, n)``, ``(n,)`` and ``()``.
         R2: the share of the observed costs' variance that it explains, adjusted for the number of
             its coefficients; NaN if there are not more observations than coefficients.
     """
@@ -45,9 +44,6 @@ class StageCost:
     q: Tensor
     c: Tensor
     R2: float = torch.nan
-
-    def __iter__(self) -> Iterator[Tensor]:
-        return iter((self.W, self.q, self.c))
 
     def __call__(self, v: Tensor) -> Tensor:
         """Return the costs ``(*batch,)`` of v ``(*batch, n)``."""
