@@ -370,7 +370,7 @@ def test_a_log_is_read_in_order():
         assert torch.equal(d, log["preview"][i, :, :1])
 
 
-def test_trajectories_end_at_flags_ids_and_gaps():
+def test_trajectories_end_at_flags_ids_and_other_observations():
     log = arx_log()
     log["next", "truncated"] = torch.zeros(3, 40, 1, dtype=torch.bool)
     log["next", "truncated"][0, 9] = True
@@ -378,25 +378,6 @@ def test_trajectories_end_at_flags_ids_and_gaps():
     log["collector", "traj_ids"][1, 25:] = 1
     log["observation"][2, 7] += 1
     assert steps_of(log) == [10, 30, 25, 15, 7, 33]
-
-
-def test_a_step_across_a_gap_in_time_is_left_out():
-    """The observations do not show it: the next one is the first after the gap."""
-    log, index = arx_log(), torch.arange(40)
-    time = 60.0 * index
-
-    def of(key: str, times: torch.Tensor) -> list[int]:
-        return steps_of(log.clone().set(key, times.unsqueeze(-1).expand(3, 40, 1)))
-
-    assert of("time", time) == [40] * 3
-    assert of("time", time + torch.rand(40)) == [40] * 3, "jitter"
-    assert of("time", 1.7e9 + 0.1 * index.double()) == [40] * 3
-    assert of("time", torch.where(index >= 25, time + 3600, time)) == [24, 15] * 3
-    assert of("time", 1.7e9 + (index + 100 * (index >= 25)).double()) == [24, 15] * 3
-    assert of("time", torch.where(index >= 10, time - 600, time)) == [9, 30] * 3
-    assert of("step_count", index + (index >= 30).long()) == [29, 10] * 3
-    log["next", "done"][:, 24] = True
-    assert of("step_count", index % 25) == [25, 15] * 3, "an end is no gap"
 
 
 def test_logs_of_different_lengths_are_read():

@@ -156,9 +156,8 @@ def identify(
     Args:
         trajectories: a `Log`, or what `read_log` takes; or logged steps, ``(T,)`` or ``(episodes,
             T)``, in a TensorDict with ``observation``, ``action`` (as applied) and ``("next",
-            "observation")``. Done flags, the ids of trajectories and
-            gaps in ``time`` or ``step_count`` are respected. A list or lazy stack of logs may have
-            different lengths.
+            "observation")``. Done flags and the ids of trajectories are respected. A list or lazy
+            stack of logs may have different lengths.
         horizon: N, the number of steps of the predictions that are reported.
         order: the number of states; by default errors of held-out predictions choose it. 0: the
             state is the outputs, measured exactly.

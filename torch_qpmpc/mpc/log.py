@@ -48,8 +48,6 @@ ENDS = (("next", "done"), ("next", "terminated"), ("next", "truncated"))
 #: Keys of collectors and of `torchrl.collectors.utils.split_trajectories`.
 IDS = (("collector", "traj_ids"), ("traj_ids",))
 MASKS = (("collector", "mask"), ("mask",))
-#: Times and step counts, whose increments are constant without a gap.
-TIMES = (("time",), ("step_count",))
 
 
 class Trajectory(NamedTuple):
@@ -156,7 +154,7 @@ def read_log(
 
     if _is_steps(data):
         if time is not None or episode is not None:
-            want = "None for a TensorDict, whose own times and flags are used"
+            want = "None for a TensorDict, whose own flags are used"
             raise QPError.expected("time, episode", f"{time!r} and {episode!r}", want)
         n_x = None if outputs is None else len(outputs)
         return _named(_of_steps(data, n_x, len(known or ())), outputs, inputs, known)
@@ -192,8 +190,7 @@ def as_log(data: Any, n_x: int | None = None, n_d: int | None = None) -> Log:
 
     A trajectory of steps in a TensorDict ends at a done flag, where the id of the trajectory
     changes, and where the next observation is not the one of the following step, as in steps
-    sampled at random. A step within a trajectory during which ``time`` or ``step_count`` jumps is
-    left out; masks of padded steps are respected.
+    sampled at random. Masks of padded steps are respected.
 
     Args:
         data: a `Log`, or as in `read_log`; or steps ``(T,)`` or ``(episodes, T)``, or a lazy stack
@@ -555,9 +552,6 @@ def cuts(steps: Any, n_x: int | None = None) -> tuple[Tensor, Tensor]:
         if (ids := steps.get(key, None)) is not None:
             ids = _narrow(key, ids, steps.shape)
             ends[:, :-1] |= ids[:, 1:] != ids[:, :-1]
-    for key in TIMES:
-        if (times := steps.get(key, None)) is not None:
-            valid = valid & ~_jumps(_narrow(key, times, steps.shape), ends)
     ends |= ~valid
     ends[:, :-1] |= ~valid[:, 1:]
     return valid, ends
@@ -573,19 +567,6 @@ def logs(data: Any) -> list[Any]:
 def valid_steps(steps: Any) -> Tensor:
     """Return True for the steps that are not padding, in the log's shape."""
     return _flags(steps, MASKS, default=True)
-
-
-def _jumps(times: Tensor, ends: Tensor) -> Tensor:
-    """Mark the steps ``(episodes, T)`` before an end during which the time jumps."""
-    eps = torch.finfo(times.dtype if times.is_floating_point() else torch.float64).eps
-    times, inside = times.double(), ~ends[:, :-1]
-    change = times.diff(dim=1)
-    gaps = torch.zeros_like(ends)
-    if inside.any():
-        step = change[inside].median()
-        rounding = 4 * eps * times.abs()[:, 1:]
-        gaps[:, :-1] = inside & ~((change - step).abs() <= 0.5 * step.abs() + rounding)
-    return gaps
 
 
 def _entry(
@@ -618,7 +599,7 @@ def _entry(
 
 
 def _narrow(key: tuple[str, ...], value: Any, batch: torch.Size) -> Tensor:
-    """Return one flag, id or time for each step; there are several for several agents, say."""
+    """Return one flag or id for each step; there are several for several agents, say."""
     if not isinstance(value, Tensor) or value.numel() != batch.numel():
         got = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
         expected = f"shape {tuple(batch)} or {(*batch, 1)}"
