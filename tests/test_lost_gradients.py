@@ -127,7 +127,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     }.items()},
     "action_bounds": (lambda t: model(action_bounds=([-1.0], t)), [0.1]),
     "constraints": (lambda t: model(constraints=(t, [-1.0], [1.0])), [[1.0, 0.0, 1.0]]),
-    "C": (lambda t: model(start={"C": t}), scheme().C_0),
+    "C": (lambda t: model(C=t), scheme().C_0),
     **{f"{name}": (lambda t, name=name: controlled(**{name: t}), x) for name, x in {
         "Q": [1.0, 0.2], "R": [0.1], "dR": [[0.1]], "E": E, "y_slack": [1.0, 1.0],
     }.items()},

@@ -132,7 +132,7 @@ def test_the_stage_cost_is_the_schemes_with_the_price_of_violations():
         stage_weight=[2.0, 4.0],
         state_bounds=([-1.0], [1.0]),
         state_slack=10.0,
-        start={"q": [1.0, 0.0] * 3 + [0.0]},
+        q=[1.0, 0.0] * 3 + [0.0],
     )
     cost = stage_cost(scheme)(torch.tensor([[3.0]]).double(), torch.tensor([[0.5]]).double())
     assert cost.item() == pytest.approx(9.0 + 0.5 + 3.0 + 20.0)

@@ -45,7 +45,7 @@ def test_it_is_the_riccati_weight_if_that_exists(hessian):
         ((2 * torch.eye(2), [[1.0], [0.0]]), {}),  # not stabilisable
         ((A.expand(4, 2, 2), B), {}),
         ((A, B), {"stage_weight": torch.stack((9 * W, 9 * W, 9 * W, W))}),
-        ((A, B), {"start": {"q": torch.ones(14)}}),  # its target is not zero
+        ((A, B), {"q": torch.ones(14)}),  # its target is not zero
     ],
 )
 def test_else_it_is_the_stages(model: Any, options: dict[str, Any]):

@@ -179,7 +179,6 @@ def discrete_actions(log: TensorDict) -> TensorDict:
             lambda: qm.identify(arx_log(), N, n_x=3),
             r"observation: got shape \(3, 40, 2\), expected",
         ),
-        (lambda: QPMPC.of(2, 1, 3, start=[1.0]), r"start: got \[1.0\], expected a mapping"),  # pyright: ignore[reportArgumentType] (the mistake)
     ],
 )
 def test_a_mistake_is_named(call, message):

@@ -266,7 +266,7 @@ class QPMPC(nn.Module):
             arguments["stage_weight"] = cost.stage_weight
             if arguments.get("terminal_weight") is None:
                 arguments["terminal_weight"] = cost.terminal_weight
-            arguments["start"] = {"q": cost.q, "c": cost.c} | (options.get("start") or {})
+            arguments = {"q": cost.q, "c": cost.c} | arguments
         return cls.of(**arguments)
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -23,8 +23,6 @@ from torch_qpmpc.qp.tracing import serially_if_forked
 GAMMA = 0.9
 #: Keyword arguments of `QPMPC` that no scheme has.
 KEYWORDS = ("learn", "structure", "step", "solver", "on_failure")
-#: The parts of theta that may start at any finite values.
-STARTED = ("q", "c", "C", "b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +82,6 @@ class Scheme:
         *,
         blocks: Sequence[int] = (),
         gamma: float = GAMMA,
-        start: Mapping[str, Any] | None = None,
         seed: int = 0,
         **options: Any,
     ) -> Scheme:
@@ -93,21 +90,18 @@ class Scheme:
         Args:
             n_x, n_u, horizon, n_d, blocks: see `Layout`.
             gamma, seed: see `Scheme`.
-            start: initial values of some of q, c, C and b by name, in place of those that follow
-                from the other arguments.
             options: the arguments of `Model`, `Cost` and `Bounds`.
 
         Raises:
             QPError: an argument is invalid.
         """
         layout = Layout(n_x, n_u, horizon, n_d, blocks=blocks)
-        arguments = {**options, **_started(start)}
         model, cost, bounds = (
-            {x.name: arguments.pop(x.name) for x in fields(kind) if x.name in arguments}
+            {x.name: options.pop(x.name) for x in fields(kind) if x.name in options}
             for kind in (Model, Cost, Bounds)
         )
-        if arguments:
-            check_names(arguments, also=())
+        if options:
+            check_names(options, also=())
         return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
 
     @property
@@ -184,7 +178,7 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
 def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, "schedule")) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
-    check_keywords("QPMPC", options, own | {"blocks", "gamma", "start", "seed", *SIZES, *also})
+    check_keywords("QPMPC", options, own | {"blocks", "gamma", "seed", *SIZES, *also})
 
 
 def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> None:
@@ -193,13 +187,3 @@ def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> 
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise TypeError(f"{owner} got an unexpected keyword argument {name!r}{hint}")
-
-
-def _started(start: Any) -> Mapping[str, Any]:
-    if start is None:
-        return {}
-    if isinstance(start, Mapping) and all(name in STARTED for name in start):
-        return start
-    got = list(start) if isinstance(start, Mapping) else repr(start)
-    wanted = f"a mapping of values by name, of {', '.join(STARTED)}"
-    raise QPError.expected("start", got, wanted)
