@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,13 +17,12 @@ import numpy as np
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.simulation import at_rest, centre, last_known
+from torch_qpmpc.control.simulation import at_rest, centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.library import FLAGS, compiled, compiler
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
-from torch_qpmpc.loops import Step, run_loop
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
 COMPARED, REPLAYED = 200, 10
@@ -81,52 +81,6 @@ class Loop(NamedTuple):
     known: Array
     u: Array
     start: Array
-
-
-class Course(NamedTuple):
-    """Signals of a loop with the controller's own model, by step.
-
-    Attributes:
-        x: the state that the model starts from, ``(n,)``.
-        load: a constant that is added to the inputs, ``(m,)``.
-        noise: what is added to the outputs, ``(T + 1, n_y)``.
-        r, known: set-points and known signals of the stages, ``(T + 1, rows, ..)``.
-    """
-
-    x: Array
-    load: Array
-    noise: Array
-    r: Array
-    known: Array
-
-
-def own_loop(
-    law: Law, course: Course, policy: Callable[[Signals], Any], steps: int
-) -> Iterator[tuple[Signals, Any]]:
-    """Yield the signals and the move of each step of a loop with the law's own model.
-
-    It ends where no input satisfies the hard bounds, or an output is above `Law.max_plausible`.
-    """
-    plant, x, k = law.design.plant, course.x, 0
-
-    def seen() -> Signals:
-        return Signals(plant.C @ x + course.noise[k], course.r[k], course.known[k])
-
-    def step(move: Any) -> Step:
-        nonlocal x, k
-        x = plant.A @ x + plant.B @ (move.u + course.load)
-        x = x + plant.E @ course.known[k][0] + plant.offset
-        k += 1
-        return Step(seen(), move)
-
-    signals = seen()
-    for after, move, _ in run_loop(policy, signals, step, steps):
-        if move.status:
-            return
-        yield signals, move
-        if (np.abs(after.y) > law.max_plausible[0]).any():
-            return
-        signals = after
 
 
 class CompiledController:
@@ -204,18 +158,20 @@ def export_controller(
             free = export_c(mpc.free, temporary, name=f"{name}_free", **options)
         reports = [plan, target, *([free] if free else [])]
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
-    course, start = _course(law, known)
-    loop = _run(law, course, start, law.policy(law.begun(start)), COMPARED)
+    course = _course(law, known)
+    start = course["u"]
+    loop = _run(law, course, law.policy(law.begun(start)), COMPARED)
     texts |= _sources(law, name, dtype, loop)
     state_bytes = difference = None
     if compiler() is not None:
         library = CompiledController(texts, name, dtype, len(start))
         library.reset(u=start)
-        state_bytes = library.state_bytes
-        own = _run(law, course, start, library.policy, len(loop.u))
-        difference = np.abs(own.u - loop.u).max(0)
+        state_bytes, steps = library.state_bytes, len(loop.u)
+        own = _run(law, course, library.policy, steps)
+        difference = np.abs(own.u[:steps] - loop.u[: len(own.u)]).max(0)
         near = NEAR[dtype] * mpc.design.scaling.u
-        if (failed := library.selftest()) or not (difference <= near).all():
+        wrong = len(own.u) < steps or not (difference <= near).all()
+        if (failed := library.selftest()) or wrong:
             got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
             raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
     folder = Path(folder)
@@ -248,30 +204,27 @@ def undetermined(mpc: LinearMPC) -> str:
     return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
 
 
-def _course(law: Law, known: Array) -> tuple[Course, Array]:
-    """Return a course with noise, a load and moving set-points, and the input that it starts with.
+def _course(law: Law, known: Array) -> dict[str, Any]:
+    """Return arguments of a loop with noise, a load and moving set-points.
 
-    It starts at rest near `centre`.
+    It starts at rest near `centre`, with the input ``u``.
     """
     rng, design = np.random.default_rng(0), law.design
-    stages, rows = design.horizon + 1, COMPARED + design.horizon + 1
+    rows = COMPARED + design.horizon + 1
     size_y, size_u = design.usual, design.scaling.u
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
-    x, start = at_rest(law.mpc, known)
+    x, u = at_rest(law.mpc, known)
     moved = 0.1 * design.scaling.d * rng.normal(size=(rows, len(known)))
     for of in design.limited:  # bounds are wider than at rest, so that there is a plan
         for places, sign in zip(of, (-1, 1), strict=True):
             moved[:, places[places >= 0]] = sign * np.abs(moved[:, places[places >= 0]])
-    d = known + moved
-    noise = 0.01 * size_y * rng.normal(size=(COMPARED + 1, len(size_y)))
     r = centre(design, known) + moves * size_y
-    ahead = np.arange(COMPARED + 1)[:, None] + np.arange(stages)
-    previewed = ahead if design.references == "preview" else ahead[:, :1]
-    return Course(x, 0.05 * size_u, noise, r[previewed], d[ahead]), start
+    disturbed = {"load": 0.05 * size_u, "noise": 0.01 * size_y}
+    return {"r": r, "u": u, "x": x, "known": known + moved, **disturbed}
 
 
-def _run(law: Law, course: Course, start: Array, policy: Any, steps: int) -> Loop:
-    """Return the loop of a policy.
+def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:
+    """Return the loop of a policy with the law's model, while there are plans for its outputs.
 
     Each policy closes a loop of its own: replaying outputs through an unstable controller would
     measure rounding alone.
@@ -279,13 +232,18 @@ def _run(law: Law, course: Course, start: Array, policy: Any, steps: int) -> Loo
     Raises:
         SolverError: no input satisfies the hard bounds in the first step.
     """
-    rows = [(*signals, move.u) for signals, move in own_loop(law, course, policy, steps)]
+    rows, stages = [], slice(None if law.design.references == "preview" else 1)
+    with suppress(QPError, SolverError):  # no plan, or outputs above `Law.max_plausible`
+        for (y, r, known), move, _ in closed_loop(
+            law, Memory(course["u"]), None, steps, act=act, **course
+        ):
+            rows.append((y, r[stages], known, move.u))
     if not rows:
         raise SolverError(
             "No input satisfies the hard bounds at rest: widen them, or give the outputs a y_slack."
         )
     y, r, known, u = map(np.array, zip(*rows, strict=True))
-    return Loop(y, r, known, u, start[None])
+    return Loop(y, r, known, u, course["u"][None])
 
 
 def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,7 @@ import torch
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design, middle
-from torch_qpmpc.control.law import Law, Memory, Move, Signals
+from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.scaling import FAINT, Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
@@ -91,20 +92,42 @@ class Run:
 
 
 def simulate(
+    law: Law, memory: Memory, plant: Any, steps: int, r: Any, *, u: Any = None, **options: Any
+) -> Run:
+    """Return a closed loop; see `Controller.simulate`."""
+    last = memory.rest[1] if u is None else read_row("u", u, law.design.plant.inputs)
+    begun = law.begun(last, not hasattr(plant, "reset"))
+    options |= {"near": 1.0 if u is None else FAINT}
+    loop = closed_loop(law, memory, plant, steps, r, begun.u, law.policy(begun), **options)
+    signals, moves, following = zip(*loop, strict=True)
+    y, r, d = ([getattr(x, name) for x in signals] for name in ("y", "r", "known"))
+    y, r = [*y, following[-1]], [*(x[0] for x in r), r[-1][1]]
+    inputs, u_s = [move.u for move in moves], [_first(move.target.u) for move in moves]
+    y, r, inputs, d, u_s = map(np.array, (y, r, inputs, [x[0] for x in d], u_s))
+    return Run(law.design, y, r, inputs, d, u_s, begun.u)
+
+
+def closed_loop(
     law: Law,
     memory: Memory,
     plant: Any,
     steps: int,
     r: Any,
+    u: Array,
+    act: Callable[[Signals], Any],
     *,
     known: Any = None,
-    u: Any = None,
     load: Any = 0.0,
     noise: Any = 0.0,
     x: Any = None,
     seed: int = 0,
-) -> Run:
-    """Return a closed loop; see `Controller.simulate`."""
+    near: float = 1.0,
+) -> Iterator[tuple[Signals, Any, Array]]:
+    """Yield the signals of each step, the move of ``act``, and the outputs after it.
+
+    A model starts at rest with the input u, ``near`` the last reset's outputs as
+    `Scaling.at_rest` weights them. Other arguments are those of `Controller.simulate`.
+    """
     check_whole("steps", steps, 1)
     check_seed(seed)
     design, rows = law.design, law.design.horizon + 1
@@ -116,13 +139,9 @@ def simulate(
     noise = read_vector("noise", noise, design.plant.outputs, 0.0)
     if not ((noise >= 0) & np.isfinite(noise)).all():
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
-    y, last = memory.rest
-    begun = law.begun(
-        last if u is None else read_row("u", u, design.plant.inputs), not hasattr(plant, "reset")
-    )
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        plant = _Model(model, design, d, begun.u, y, FAINT if u is not None else 1.0, x)
+        plant = _Model(model, design, d, u, memory.rest[0], near, x)
     rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
     if not (isinstance(started, tuple) and len(started) == 2):
         remedy = "Its reset returns the outputs and a dict."
@@ -133,31 +152,29 @@ def simulate(
         want = f"the outputs alone, {', '.join(design.plant.outputs)}"
         remedy = "Wrap the environment: gymnasium.wrappers.TransformObservation chooses entries."
         raise QPError.expected("plant", got, want, remedy)
-    k, act = 0, law.policy(begun)
+    k, signals = 0, Signals(observed, set_points, d)
 
     def measured() -> Array:
         return observed + noise * rng.normal(size=len(noise))
 
-    def policy(y: Array) -> Move:
+    def policy(y: Array) -> Any:
+        nonlocal signals
         ahead = law.read_known(info.get("known"), rows) if announced else d[k : k + rows]
-        move = act(Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead))
-        if move.target is None:
+        signals = Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead)
+        move = act(signals)
+        if move.status not in (Outcome.SOLVED, Outcome.MISSING):
             remedy = "Widen the hard bounds, or give the outputs a y_slack."
             raise SolverError(f"Step {k} of the loop has no plan: {move.status.name}. {remedy}")
         return move
 
-    def step(move: Move) -> Step:
+    def step(move: Any) -> Step:
         nonlocal observed, info, k
         observed, *_, info = plant.step(move.u + load)
         k += 1
         return Step(measured(), move)
 
-    first = measured()
-    ys, moves, _ = zip(*run_loop(policy, first, step, steps), strict=True)
-    signals = ((move.u, move.memory.known, _first(move.target.u)) for move in moves)
-    inputs, passed, u_s = map(np.array, zip(*signals, strict=True))
-    measurements = np.array([first, *ys])
-    return Run(design, measurements, set_points[: steps + 1], inputs, passed, u_s, begun.u)
+    for y, move, _ in run_loop(policy, measured(), step, steps):
+        yield signals, move, y
 
 
 def _first(target: torch.Tensor) -> Array:
