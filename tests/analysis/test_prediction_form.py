@@ -48,6 +48,15 @@ def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:
     return C, N_X, N_U, b
 
 
+def test_a_small_C_is_as_good_as_any():
+    C, n_x, n_u, b = _of("free")
+    scale = torch.logspace(-12, 3, len(C)).double().unsqueeze(-1)
+    form = prediction_form(C, n_x, n_u, b)
+    scaled = prediction_form(scale * C, n_x, n_u, scale[:, 0] * b)
+    torch.testing.assert_close(scaled.Gamma, form.Gamma)
+    torch.testing.assert_close(scaled.condition, form.condition)
+
+
 def test_a_C_that_does_not_determine_the_states_is_refused():
     C, n_x, n_u, _ = _of("tied")
     dependent = C.clone()

@@ -16,6 +16,7 @@ from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.structure import (
     NearestModel,
     PredictionForm,
+    canonical_matrix,
     causality_defect,
     distance_by_band,
     nearest_model,
@@ -58,6 +59,16 @@ def free_form(seed: int = 0) -> PredictionForm:
     return form_of(banded_matrix(0.5 * A, B, N) + 0.1 * normal(*C_0.shape, seed=seed))
 
 
+def scheme_with(*earlier: Tensor) -> Tensor:
+    """Make C of x_{k+1} = A x_k + B u_k plus terms in (x_j, u_j) for j = k - 1, k - 2, ..."""
+    C, n = banded_matrix(0.3 * A, B, N), N_X + N_U
+    for back, block in enumerate(earlier, start=1):
+        for k in range(back, N):
+            first = (k - back) * n
+            C[k * N_X : (k + 1) * N_X, first : first + n] = block
+    return C
+
+
 def test_defects_are_sums_over_blocks():
     form = free_form()
     total = above = departure = 0.0
@@ -74,6 +85,13 @@ def test_defects_are_sums_over_blocks():
     assert causality_defect(form).item() == pytest.approx((above / total) ** 0.5, rel=1e-12)
     assert toeplitz_defect(form).item() == pytest.approx((departure / total) ** 0.5, rel=1e-12)
     assert above > 0.01 * total
+
+
+def test_defects_of_a_batch():
+    forms = [free_form(seed) for seed in (0, 1)]
+    C = torch.stack([canonical_matrix(form, stage_models(form).A)[0] for form in forms])
+    for defect in (causality_defect, toeplitz_defect):
+        torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
 
 
 def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
@@ -146,6 +164,15 @@ def test_directions_that_no_prediction_reaches_are_not_made_up():
     torch.testing.assert_close(found.A[1:], expected.expand(N - 1, 2, 2))
     assert nearest_model(form).residual < 1e-12
     torch.testing.assert_close(nearest_model(form).A, nilpotent)
+
+
+def test_an_older_pair_is_in_the_residual_of_the_stages():
+    """In any gauge, and causally."""
+    T = normal(N * N_X, N * N_X, seed=8)
+    form = form_of(T @ scheme_with(0.3 * normal(N_X, N_X + N_U, seed=9)))
+    assert stage_models(form).residual[1:].min() > 1e-3
+    assert causality_defect(form) < 1e-10
+    assert stage_models(form_of(T @ scheme_with())).residual.max() < 1e-9
 
 
 TRUE_A, TRUE_B, OFFSET = normal(3, 3, seed=1), normal(3, 2, seed=2), normal(3, seed=3)

@@ -101,6 +101,14 @@ def exported(tmp_path_factory):
     return controller, files, load(files, controller)
 
 
+def test_an_output_is_missing_from_the_largest_plausible_one_on(exported):
+    controller, _, twin = exported
+    for share, missing in ((1.0, False), (1.001, True)):
+        twin.reset([0.0], [0.0])
+        twin.step([0.1], [1.0])
+        assert (twin.step(share * controller.max_plausible[0])[1] == 4) == missing
+
+
 def test_an_absurd_known_signal_leaves_the_estimates_alone(tmp_path):
     controller = qm.Controller(learned())
     twin = load(controller.export_c(tmp_path).files, controller)

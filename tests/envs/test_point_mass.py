@@ -89,6 +89,15 @@ def test_bad_noise_is_an_error():
             PointMass(noise_std=std)
 
 
+def test_gymnasium_random_walk_restarts_with_the_episode():
+    env = PointMassGymEnv(PointMass("brownian", noise_std=1.0))
+    first, _ = env.reset(seed=1)
+    one = env.step(np.zeros(2, dtype=np.float32))[0]
+    again, _ = env.reset(seed=1)
+    np.testing.assert_array_equal(again, first)
+    np.testing.assert_array_equal(env.step(np.zeros(2, dtype=np.float32))[0], one)
+
+
 @pytest.mark.parametrize("kind", STREAMS)
 def test_random_streams_stay_as_they_were(kind):
     p, nothing = PointMass(kind), torch.zeros(2, 2, dtype=torch.float64)

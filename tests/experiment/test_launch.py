@@ -21,7 +21,7 @@ from tests.runs import CONFIGS, SMALL, choices, make_config
 from tests.stops import assert_same_numbers, go_on
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import evaluation
-from torch_qpmpc.experiment.launch import LOCK, launched, locked
+from torch_qpmpc.experiment.launch import LOCK, Interrupt, launched, locked
 from torch_qpmpc.experiment.run_folder import load_checkpoint
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.qp.pipeline.solve import SolveLog
@@ -96,6 +96,15 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
     train.train(make_config(*RUN), str(folder), quiet=True)
     return folder
+
+
+def test_the_first_signal_is_noted_and_the_second_acts(listening):
+    with Interrupt() as interrupt:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt.signum == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize(

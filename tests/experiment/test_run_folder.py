@@ -6,6 +6,7 @@ import errno
 import importlib.util
 import json
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -131,6 +132,23 @@ def test_a_failed_write_is_reported(tmp_path):
     (tmp_path / "checkpoint.pt").touch()
     with pytest.raises(QPError, match=f"free space, then python train.py resume={tmp_path}.$"):
         raise unwritable(tmp_path, error)
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json"])
+def test_a_file_is_as_it_was_when_writing_fails(tmp_path, monkeypatch, name):
+    with RunFolder(tmp_path, make_config()) as run:
+        run.log({"eval/J": 1.0}, 1)
+        run.finish({"J_final": 1.0})
+    before = (tmp_path / name).read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"), RunFolder(tmp_path, make_config()) as run:
+        run.finish({"J_final": 2.0})
+    assert (tmp_path / name).read_bytes() == before
+    assert not list(tmp_path.glob("*.partial"))
 
 
 def test_the_log_survives_an_interruption(tmp_path):

@@ -131,6 +131,17 @@ def test_only_a_stopped_run_resumes(tmp_path, stopped):
         resumed(stopped, [])
 
 
+def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
+    state = load_checkpoint(stopped / "checkpoint.pt")
+    state["config"] |= {"release": None}
+    save_checkpoint(stopped / "checkpoint.pt", state)
+    with (stopped / "config.yaml").open("a") as file:
+        file.write("release: null\n")
+    cfg, state = resumed(stopped, [])
+    train.train(cfg, str(stopped), state)
+    assert_same_numbers(stopped, whole)
+
+
 def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     whole = load_checkpoint(stopped / "checkpoint.pt")
     state = {name: part for name, part in whole.items() if name != "config"}

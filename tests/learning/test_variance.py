@@ -59,3 +59,9 @@ def test_few_pairs_or_errors_of_zero_have_weight_one():
     few = slice(0, 15)
     assert (inverse_variance(p[few], a[few], value[few], a[few, 0], use[few]) == 1).all()
     assert (inverse_variance(p, a, value, torch.zeros(COUNT).double(), use) == 1).all()
+
+
+def test_equal_inputs_leave_the_weights_finite():
+    p, a, value, use = (x[:50] for x in pairs())
+    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
+    assert weight.isfinite().all()

@@ -202,6 +202,12 @@ def fitted(log: Any, **arguments: Any) -> BlendedModel:
     return BlendedModel(**qm.identify_blended(log, 3, centres=2).arguments | arguments)
 
 
+def test_an_empty_batch_has_no_values(model):
+    mpc, none = scheduled(model), torch.zeros(3, 0, 2)
+    assert mpc.value(none).shape == (3, 0)
+    assert mpc.policy(none).shape == (3, 0, 1)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

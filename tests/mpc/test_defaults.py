@@ -122,3 +122,9 @@ def test_a_random_start_warns_once_when_its_policy_acts():
         loaded.load_state_dict(mpc.state_dict())
         loaded.policy_and_active_set(s)
         QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1]).policy(s)
+
+
+def test_a_random_start_compiles():
+    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
+    compiled = torch.compile(mpc.policy, backend="eager", fullgraph=True)
+    assert_close(compiled(s), mpc.policy(s))

@@ -6,6 +6,7 @@ import copy
 import pickle
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -187,6 +188,19 @@ def test_a_state_dict_of_other_frozen_entries_is_refused():
         masked(entries()).load_state_dict(masked(rows()).state_dict())
 
 
+def test_arguments_are_kept_by_value():
+    A, mask = np.array([[1.0, 0.1], [0.0, 0.9]]), rows()
+    options = {"learn": {"C": mask}, "stage_weight": [1.0, 1.0, 0.1]}
+    mpc = QPMPC.from_model(A, [[0.0], [0.1]], HORIZON, **options)
+    start = mpc.C.detach().clone()
+    A *= 2
+    mask.logical_not_()
+    options["learn"].clear()
+    mpc.reset_parameters()
+    assert torch.equal(mpc.C, start)
+    assert torch.equal(pickle.loads(pickle.dumps(mpc)).C, start)
+
+
 @pytest.mark.parametrize("convert", [lambda x: x.double(), lambda x: x.float() + 1e-3])
 def test_a_converted_state_dict_is_loaded(convert):
     mpc = random_mpc(0)
@@ -238,3 +252,12 @@ def test_a_gauss_newton_is_not_copied_without_its_qpmpc(copied):
     message = "GaussNewton: got a copy or a pickle, expected its state_dict. Make a GaussNewton"
     with pytest.raises(QPError, match=message):
         copied(GaussNewton(random_mpc(0)))
+
+
+def test_a_gauss_newton_step_with_everything_frozen_moves_nothing():
+    mpc = random_mpc(0)
+    s, a, target = targets(mpc)
+    mpc.requires_grad_(False)
+    before = mpc.C.clone()
+    GaussNewton(mpc).step(s, a, target)
+    assert torch.equal(mpc.C, before)

@@ -14,6 +14,7 @@ from torch.testing import assert_close
 
 from tests.problems import random_mpc, random_states
 from torch_qpmpc import QPMPC, Layout, QPError
+from torch_qpmpc.export.tables import make_tables
 
 # Sizes
 
@@ -93,6 +94,13 @@ def test_gradients_of_blocks_pass_finite_differences():
         return torch.cat((functional_call(mpc, named, (s,)), functional_call(mpc, named, (s, a))))
 
     assert torch.autograd.gradcheck(values, [x.detach().clone().requires_grad_() for x in start])
+
+
+def test_blocks_leave_fewer_variables_and_rows():
+    free, held = (make_tables(blocked(blocks)) for blocks in ([], [1, 3]))
+    assert (free.R.shape[1], held.R.shape[1]) == (4, 2)
+    # Bounds and a row of D for each of two stages.
+    assert len(free.rows) - len(held.rows) == 4
 
 
 def test_residuals_and_copies_keep_blocks(tmp_path):

@@ -309,6 +309,16 @@ def test_readable_parts_are_the_model_and_the_rows():
     assert_close(mpc.model(), (A_D, B_D, E))
 
 
+def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
+    mpc = random_mpc(
+        9, free=0.0, learn=("w", "lb", "ub"), state_bounds=([-1.0, -torch.inf], [1, 1])
+    )
+    mpc.value(random_states(6)).sum().backward()
+    for name, parameter in mpc.named_parameters():
+        assert parameter.grad is not None
+        assert parameter.grad.isfinite().all(), name
+
+
 # Learning
 
 

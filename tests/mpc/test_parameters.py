@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -149,6 +150,15 @@ def test_a_functional_call_uses_its_own_theta():
         assert np.abs(found - expected).max() <= 1e-9
     assert np.abs(mpc.predict(s) - own).max() <= 1e-12
     assert np.abs(own - expected).max() > 1e-3
+
+
+def test_a_copy_has_a_theta_of_its_own():
+    mpc = random_mpc(3)
+    own = mpc.predict(STATES[0])
+    twin = copy.deepcopy(mpc)
+    moved(twin)
+    assert_predicted(twin)
+    assert np.abs(mpc.predict(STATES[0]) - own).max() <= 1e-9
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

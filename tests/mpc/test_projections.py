@@ -117,6 +117,12 @@ def test_semidefinite_matrices_are_unchanged_to_the_last_bit(nearest):
 
 
 @pytest.mark.parametrize("nearest", NEAREST.values())
+def test_of_a_matrix_that_is_not_symmetric_the_symmetric_part_counts(nearest):
+    H = normal(3, 3)
+    assert_close(nearest(H), nearest((H + H.mT) / 2), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("nearest", NEAREST.values())
 def test_non_finite_qps_go_to_the_solver(nearest):
     H = -torch.eye(2).repeat(2, 1, 1)
     H[0, 0, 0] = torch.nan
@@ -222,6 +228,16 @@ def test_gauss_newton_judges_the_projected_step(name):
     start, actual = squares(torch.zeros(5)), mpc.action_value(s, a).detach() - old.detach()
     gain = start - squares(rows @ (theta() - before))
     assert report.ratio == pytest.approx((start - squares(actual)) / gain, rel=1e-6)
+
+
+def test_the_factor_is_never_projected():
+    mpc = random_mpc(5, **HESSIANS["block"])
+    with torch.no_grad():
+        for leaf in mpc.parameters():
+            leaf -= 3.0
+    before = copy.deepcopy(mpc.state_dict())
+    mpc.project_()
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
 
 
 # --- Bad input -----------------------------------------------------------------------------------
