@@ -209,13 +209,6 @@ def test_one_row(changes, v_1, lam_1):
     assert_allclose(answer.lam, np.tile([lam_1, 0.0], (3, 1)), atol=1e-9)
 
 
-def test_without_rows_the_answer_is_that_of_a_linear_system():
-    none = np.zeros((3, 0))
-    answer = interior_point.solve(one_row(G=np.zeros((1, 0, 2)), l=none, u=none, w=none))
-    assert_allclose(answer.v, np.full((3, 2), -9.0), atol=1e-9)
-    assert answer.lam.shape == (3, 0)
-
-
 def test_without_variables_the_rows_are_only_checked():
     answer = interior_point.solve(
         one_row(H=np.zeros((1, 0, 0)), G=np.zeros((1, 2, 0)), g=np.zeros((3, 0)))

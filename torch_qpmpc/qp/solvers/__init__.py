@@ -1,7 +1,7 @@
 """The backends, one per file, which solve reduced QPs (eq:qp2, eq:qp3).
 
-A backend is a function ``solve(qps: SoftQPs) -> BackendSolution``. To add one, write its file and
-list it in `BACKENDS`.
+A backend is a function ``solve(qps: SoftQPs) -> BackendSolution`` of QPs with at least one row. To
+add one, write its file and list it in `BACKENDS`.
 """
 
 from __future__ import annotations

@@ -78,17 +78,13 @@ def _solve_alike(qps: SoftQPs) -> BackendSolution:
     if flag < 0:
         return BackendSolution(v, lam, iterations)  # zeros, which the certificate rejects
     model.settings = SETTINGS
-    if len(hard):  # soft_weights refuses empty arrays
-        model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
+    model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[0], w_u=weight[0])
     many = len(g) >= MANY
     update, solve_one, failed = model.update, model.solve, False
     for k in tour(g, NEAR).tolist() if many else range(len(g)):
         # Without a ``sense``, the model starts from its last active set.
         sense = None if many and not failed else empty
-        if not len(hard):
-            update(f=g[k])
-        else:
-            update(f=g[k], bupper=upper[k], blower=lower[k], sense=sense)
+        update(f=g[k], bupper=upper[k], blower=lower[k], sense=sense)
         if not same_weight:
             model.soft_weights(rho_l=rho, rho_u=rho, w_l=weight[k], w_u=weight[k])
         v[k], _, flag, info = solve_one()

@@ -230,10 +230,6 @@ def solve(qps: SoftQPs) -> BackendSolution:
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
     qps = qps.in_torch()
-    if not qps.w.shape[-1]:  # add a row without weight: an empty dimension has no maximum
-        none, row = qps.g.new_zeros(len(qps.g), 1), torch.zeros_like(qps.H[:, :1])
-        solution = solve(qps._replace(G=row, l=none, u=none, w=none))
-        return solution._replace(lam=solution.lam[:, 1:])
     form = BatchedQPs.of(qps)
     point, todo = _begin(form), torch.arange(len(form), device=qps.g.device)
     unsolved = torch.full_like(form.cost, torch.inf)
