@@ -13,10 +13,8 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba.core import config
 from numba.core.event import Event, Listener, register
-from numba.extending import intrinsic
 
 from torch_qpmpc.errors import QPError
 
@@ -61,24 +59,8 @@ class Progress(Listener):
 register("numba:compile", Progress())
 
 
-# LLVM vectorises loops whose sums may be reordered, or whose entries are never NaN.
+# LLVM vectorises loops whose sums may be reordered.
 summing = partial(compiled, fastmath={"reassoc", "contract"})
-comparing = partial(compiled, fastmath={"nnan", "nsz"})
-
-
-def _larger(_, x, y):
-    """Return max(x, y) of numbers that are not NaN; Python's max is not vectorised."""
-
-    def generate(_, builder, signature, numbers):
-        double = ir.DoubleType()
-        kind = ir.FunctionType(double, (double, double))
-        maximum = builder.module.declare_intrinsic("llvm.maxnum", (double,), kind)
-        return builder.call(maximum, numbers)
-
-    return numba.float64(numba.float64, numba.float64), generate
-
-
-larger: Any = intrinsic(_larger)
 
 
 @compiled

@@ -45,11 +45,9 @@ import numpy as np
 from torch_qpmpc.qp.kernels.linalg import (
     add,
     add_product,
-    comparing,
     compiled,
     copy,
     dot,
-    larger,
     products,
     summing,
     transposed_products,
@@ -469,27 +467,27 @@ def _shortage(Cz, b, chi):
     return slip
 
 
-@comparing
+@compiled
 def _forces(z, Hz, G_lam, C_chi, left, q):
     """Return the largest absolute terms of stationarity, its residual, and z."""
     force = slope = length = 0.0
     for j in range(len(z)):
-        force = larger(force, larger(abs(q[j]), abs(Hz[j])))
-        force = larger(force, larger(abs(G_lam[j]), abs(C_chi[j])))
-        slope, length = larger(slope, abs(left[j])), larger(length, abs(z[j]))
+        force = max(force, max(abs(q[j]), abs(Hz[j])))
+        force = max(force, max(abs(G_lam[j]), abs(C_chi[j])))
+        slope, length = max(slope, abs(left[j])), max(length, abs(z[j]))
     return force, slope, length
 
 
-@comparing
+@compiled
 def _distance(x, y):
     """Return the largest absolute entries of x - y and of y."""
     difference = size = 0.0
     for j in range(len(y)):
-        difference, size = larger(difference, abs(x[j] - y[j])), larger(size, abs(y[j]))
+        difference, size = max(difference, abs(x[j] - y[j])), max(size, abs(y[j]))
     return difference, size
 
 
-@comparing
+@compiled
 def _excess(y, lam, lb, ub, w):
     """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound."""
     error = 0.0
@@ -497,10 +495,10 @@ def _excess(y, lam, lb, ub, w):
         at, force, weight = y[j], lam[j], w[j]
         above, below = ub[j], lb[j]
         hard = weight == np.inf
-        excess = larger(at - above, below - at) if hard else abs(force) - weight
+        excess = max(at - above, below - at) if hard else abs(force) - weight
         excess /= 1.0 + (abs(at) if hard else weight)
-        astray = larger(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
-        error = larger(error, larger(excess, astray))
+        astray = max(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
+        error = max(error, max(excess, astray))
     return error
 
 
