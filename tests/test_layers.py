@@ -37,7 +37,7 @@ BUDGET = {
     "learning": 2798,
     "mpc": 5014,
     "proofs": 999,
-    "qp": 5671,
+    "qp": 5622,
     "study": 548,
 }
 #: Libraries that only some layers may import.

@@ -13,18 +13,11 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core import config
 from numba.core.event import Event, Listener, register
-
-from torch_qpmpc.errors import QPError
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
 TINY = np.finfo(float).tiny
-
-if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue] -- set from the environment
-    remedy = "Unset it before the import: the kernels do not run in plain Python."
-    raise QPError.expected("NUMBA_DISABLE_JIT", "1", "0", remedy)
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
