@@ -158,7 +158,7 @@ def _train(
                 if cfg.replay:
                     replay.remember(sample)
                 learner.scheduler.step()
-            tally.add(batch, physics.violations(batch))
+            tally.add(batch)
             progress.update()
 
             if update % cfg.log_interval == 0:

@@ -242,7 +242,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("num_envs: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(0, 5, 1)),
     ("task.id: got NoneType, expected a str.", lambda: GymnasiumPlant(None)),
     ("max_steps: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(1, 0, 1)),
-    ("s: got shape (2,), expected shape (*batch, 3).", lambda: pendulum.violation(zeros(2))),
     (
         "resume: got /nonexistent, which does not exist, expected a run",
         lambda: resumed("/nonexistent", []),

@@ -57,9 +57,6 @@ class Inventory(Plant):
     def step(self, x, u, w):
         return torch.cat((x.sum(-1, keepdim=True) - w, u), -1)
 
-    def violation(self, x, w):
-        return (-x[..., 0]).relu()
-
     def base_stock(self):
         """Return the level of stock and orders up to which it is optimal to order.
 

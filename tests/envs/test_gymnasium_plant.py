@@ -281,9 +281,3 @@ def test_one_seed_is_one_set_of_different_episodes():
     assert torch.equal(starts(1), starts(1))
     assert not torch.equal(starts(1), starts(2))
     assert len(starts(1).unique(dim=0)) == 3
-
-
-def test_violation_is_the_distance_to_the_box():
-    plant = GymnasiumPlant("Pendulum-v1")
-    s = torch.tensor([[1.0, 0.0, -8.0], [1.5, -1.25, 9.0]])
-    assert plant.violation(s).tolist() == [0, 1.75]

@@ -46,13 +46,10 @@ def test_transitions_follow_the_plant():
         assert torch.equal(now["state"], x)
         assert torch.equal(now["observation"], PLANT.output(x, w[:, k]))
         assert torch.equal(now["preview"], w[:, k : k + 4, :2].flatten(1))
-        assert torch.equal(now["violation"], PLANT.violation(x, w[:, k]).unsqueeze(-1))
         assert torch.equal(now["next", "reward"], -PLANT.cost(x, u, w[:, k]).unsqueeze(-1))
         x = PLANT.step(x, u, w[:, k])
         assert torch.equal(now["next", "state"], x)
         assert torch.equal(now["next", "preview"], w[:, k + 1 : k + 5, :2].flatten(1))
-    assert torch.equal(PLANT.violations(data), data["violation"])
-    assert data["violation"].max() > 0
     assert not data["next", "terminated"].any()
     assert data["next", "truncated"].squeeze(-1).nonzero()[:, 1].tolist() == [5] * 4
 
@@ -74,7 +71,7 @@ def test_partial_resets_restart_exactly_the_finished_episodes():
     assert done.any(0).all(), "every step ends some episode"
     assert not done.all(0).any(), "no step ends all"
     now, then, ended = data[:, 1:], data[:, :-1], done[:, :-1]
-    for key in ("observation", "preview", "state", "episode", "step_count", "violation"):
+    for key in ("observation", "preview", "state", "episode", "step_count"):
         assert torch.equal(now[key][~ended], then["next", key][~ended]), key
         assert not torch.equal(now[key][ended], then["next", key][ended]), key
     assert (now["step_count"][ended] == 0).all()

@@ -19,13 +19,12 @@ def batch(reward: float) -> TensorDict:
     return TensorDict({"next": {"reward": torch.full((3, 2, 1), reward)}}, batch_size=[3, 2])
 
 
-def test_costs_and_violations_are_summed():
+def test_costs_are_averaged():
     tally = Tally()
     for update in range(1, 21):
-        tally.add(batch(-float(update)), torch.tensor([0.5, 0.25]))
-    assert (tally.update, tally.violation) == (20, 15)
-    row = tally.metrics()
-    assert (row["train/reward"], row["train/violation"]) == (-20, 15)
+        tally.add(batch(-float(update)))
+    assert tally.update == 20
+    assert tally.metrics()["train/reward"] == -20
     summary = tally.summary()
     assert (summary["train_cost"], summary["train_cost_last_tenth"]) == (10.5, 19.5)
 
@@ -35,7 +34,7 @@ def test_a_row_has_the_qps_since_the_one_before():
     for count in (4, 2):
         with tally.timed():
             mpc.value(random_states(count))
-        tally.add(batch(0.0), torch.zeros(1))
+        tally.add(batch(0.0))
         tally.qps.unsolved += 1
         row = tally.metrics()
         assert (row["qp/solves"], row["qp/unsolved"]) == (count, 1)
@@ -58,7 +57,7 @@ def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyP
 
 def test_a_tally_is_restored_from_its_state():
     tally = Tally()
-    tally.add(batch(-1.0), torch.ones(2))
+    tally.add(batch(-1.0))
     tally.qps.solves = 7
     twin = Tally()
     twin.load_state_dict(tally.state_dict())

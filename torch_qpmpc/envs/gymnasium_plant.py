@@ -18,11 +18,10 @@ import torch
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FlattenObservation, TransformAction
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
-from torch_qpmpc.checks import check_kind, check_seed, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_seed, check_whole
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.innovations import Innovations
@@ -130,20 +129,6 @@ class GymnasiumPlant:
             env.append_transform(KalmanFilter(self.observer))
         env.set_seed(seed)
         return env
-
-    def violation(self, s: Tensor) -> Tensor:
-        """Return how far s ``(*batch, n_x)`` is outside its space, summed, ``(*batch,)``.
-
-        Of a model's state it is that of the outputs.
-        """
-        s = check_tensor("s", s, self.n_x).to(self.lb_s)
-        if self.observer is not None:
-            s = s @ torch.as_tensor(self.observer.C).mT
-        return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
-
-    def violations(self, batch: TensorDictBase) -> Tensor:
-        """Return the `violation` of each transition of a collected ``batch``."""
-        return self.violation(batch["observation"])
 
 
 class _Guarded(gymnasium.Wrapper):

@@ -162,10 +162,6 @@ class LinearSystem(ABC):
         s = check_tensor("s", s, len(self.A)).to(self.A)
         return ((self.lb_s - s).relu() + (s - self.ub_s).relu()).sum(-1)
 
-    def violations(self, batch: TensorDictBase) -> Tensor:
-        """Return the `violation` of each transition of a collected ``batch``."""
-        return self.violation(batch["observation"])
-
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """Return s+ = A s + B a + nu, with a clipped and, if `clips_states`, s+ too.
 

@@ -97,18 +97,10 @@ class Plant(ABC):
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return x+ = f(x, u, w) ``(*batch, n_x)``, for the applied u."""
 
-    def violation(self, x: Tensor, w: Tensor) -> Tensor:
-        """Return how far ``x`` is outside its bounds under ``w``, summed, ``(*batch,)``; here 0."""
-        return x.new_zeros(x.shape[:-1])
-
     def applied(self, a: Tensor) -> Tensor:
         """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
         check_tensor("a", a, self.n_u)
         return a.to(self.lb_a).clamp(self.lb_a, self.ub_a)
-
-    def violations(self, batch: TensorDictBase) -> Tensor:
-        """Return the `violation` of each transition of a collected ``batch``."""
-        return batch["violation"]
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps.
@@ -152,7 +144,7 @@ class PlantEnv(VectorisedEnv):
         self.plant = p = plant.to(self.device)
         self.episodes = episodes
         n_x = p.starts(torch.Generator(device=self.rng.device), 1).shape[-1]
-        observed = {"observation": self._reals(p.n_y), "violation": self._reals(1)}
+        observed = {"observation": self._reals(p.n_y)}
         if p.n_d:
             observed["preview"] = self._reals((p.horizon + 1) * p.n_d)
         hidden = {"state": self._reals(n_x, torch.float64), "episode": self._reals(1, torch.int64)}
@@ -180,10 +172,7 @@ class PlantEnv(VectorisedEnv):
     def _observed(self, x: Tensor, episode: Tensor, count: Tensor) -> TensorDict:
         p = self.plant
         w = self._signals[episode, count + torch.arange(p.horizon + 1, device=count.device)]
-        shown = {
-            "observation": p.output(x, w[:, 0]),
-            "violation": p.violation(x, w[:, 0]).unsqueeze(-1),
-        }
+        shown = {"observation": p.output(x, w[:, 0])}
         if p.n_d:
             shown["preview"] = w[..., : p.n_d].flatten(-2)
         shown = {name: value.to(self.dtype) for name, value in shown.items()}

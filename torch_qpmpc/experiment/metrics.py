@@ -38,7 +38,6 @@ class Tally:
     Attributes:
         update: number of the last update.
         costs: mean stage cost of each update.
-        violation: violation of the state bounds, summed over all steps.
         qps: counts of solves since the last row of metrics.
         unsolved: number of unsolved QPs before that.
         seconds: training time without the compilation of kernels.
@@ -46,7 +45,6 @@ class Tally:
 
     update: int = 0
     costs: list[float] = field(default_factory=list)
-    violation: float = 0.0
     qps: SolveLog = field(default_factory=SolveLog)
     unsolved: int = 0
     seconds: float = 0.0
@@ -72,27 +70,24 @@ class Tally:
         times.append(time.perf_counter())
         self.seconds += times[-1] - times[0]
 
-    def add(self, batch: TensorDictBase, violation: Tensor) -> None:
-        """Add an update with its collected batch and the violation of each state."""
+    def add(self, batch: TensorDictBase) -> None:
+        """Add an update with its collected batch."""
         self.update += 1
         self.costs.append(-batch["next", "reward"].nanmean().item())
-        self.violation += violation.sum().item()
 
     def metrics(self) -> dict[str, float]:
         """Return the scalars of a row; QPs are counted since the previous row."""
-        row = {"train/reward": -self.costs[-1], "train/violation": self.violation}
-        row |= self.qps.metrics()
+        row = {"train/reward": -self.costs[-1], **self.qps.metrics()}
         self.unsolved, self.qps = self.unsolved + self.qps.unsolved, SolveLog()
         return row
 
     def summary(self) -> dict[str, float]:
-        """Return the totals: time, violation, unsolved QPs, and the mean cost during training."""
+        """Return the totals: time, unsolved QPs, and the mean cost during training."""
         last = self.costs[-max(1, len(self.costs) // 10) :]
         return {
             "train_seconds": self.seconds,
             "train_cost": sum(self.costs) / len(self.costs),
             "train_cost_last_tenth": sum(last) / len(last),
-            "train_violation": self.violation,
             "unsolved": self.unsolved + self.qps.unsolved,
         }
 
