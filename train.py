@@ -51,11 +51,13 @@ from torch_qpmpc.experiment.metrics import (
     update_metrics,
 )
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, save_checkpoint
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import COMMAND, named_task, resume_arguments
+from torch_qpmpc.files import save_file
+from torch_qpmpc.mpc.state import KIND
 
 # Absolute, so that a user's script can call main.
 CONFIGS = str(Path(__file__).with_name("configs"))
@@ -177,7 +179,7 @@ def _train(
             if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)
-                save_checkpoint(run.path / CHECKPOINT, state)
+                save_file(run.path / CHECKPOINT, KIND, state)
                 gate.save(run.path)
             if not last:
                 interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")

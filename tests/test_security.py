@@ -20,9 +20,10 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPMPC, QPError, export_c
 from torch_qpmpc.experiment.config import settings
-from torch_qpmpc.experiment.run_folder import learned_qp, load_checkpoint
+from torch_qpmpc.experiment.run_folder import learned_qp
 from torch_qpmpc.experiment.start import stored_log
-from torch_qpmpc.files import labelled, write_whole
+from torch_qpmpc.files import labelled, load_file, write_whole
+from torch_qpmpc.mpc.state import KIND
 from torch_qpmpc.study.report import main as report
 
 
@@ -49,7 +50,7 @@ def folder(runs: Path, tmp_path: Path) -> Path:
 
 def change(folder: Path, **changes: object) -> None:
     """Change keys of config.yaml and of the checkpoint, which resuming compares."""
-    cfg, state = OmegaConf.load(folder / "config.yaml"), load_checkpoint(folder / "checkpoint.pt")
+    cfg, state = OmegaConf.load(folder / "config.yaml"), load_file(folder / "checkpoint.pt", KIND)
     assert isinstance(cfg, DictConfig)
     for key, value in changes.items():
         OmegaConf.update(cfg, key.replace("__", "."), value, force_add=True)

@@ -57,8 +57,8 @@ def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
 
 
 def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
-    """Read a file of a ``kind``, which the class ``writer`` wrote, or that kind's."""
-    expected = f"a file that {writer or kind}.save wrote"
+    """Read a file of a ``kind``, which ``writer`` wrote, by default that kind's ``save``."""
+    expected = f"a file that {writer or f'{kind}.save'} wrote"
     try:
         content = read_tensors(Path(path))
     except FileNotFoundError as error:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.run_folder import load_checkpoint, save_checkpoint
+from torch_qpmpc.files import load_file, save_file
+from torch_qpmpc.mpc.state import KIND
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def path(tmp_path: Path) -> Path:
     """Write two checkpoints, one after the other."""
     path = tmp_path / "checkpoint.pt"
     for update in (1, 2):
-        save_checkpoint(path, {"update": update, "C": torch.arange(99.0)})
+        save_file(path, KIND, {"update": update, "C": torch.arange(99.0)})
     return path
 
 
@@ -27,8 +28,8 @@ def names(path: Path) -> set[str]:
 
 
 def test_a_full_disk_leaves_the_checkpoint_as_it_is(path, monkeypatch):
-    assert load_checkpoint(path)["update"] == 2
-    assert torch.equal(load_checkpoint(path)["C"], torch.arange(99.0))
+    assert load_file(path, KIND)["update"] == 2
+    assert torch.equal(load_file(path, KIND)["C"], torch.arange(99.0))
     before = path.read_bytes()
 
     def full(*_: object) -> None:
@@ -37,11 +38,11 @@ def test_a_full_disk_leaves_the_checkpoint_as_it_is(path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.raises(OSError, match="No space left"):
-            save_checkpoint(path, {"update": 3})
+            save_file(path, KIND, {"update": 3})
     assert path.read_bytes() == before
     assert names(path) == {"checkpoint.pt"}
-    save_checkpoint(path, {"update": 3})  # the crash's leftovers do not interfere
-    assert load_checkpoint(path)["update"] == 3
+    save_file(path, KIND, {"update": 3})  # the crash's leftovers do not interfere
+    assert load_file(path, KIND)["update"] == 3
 
 
 def test_a_flipped_bit_is_found_or_changes_nothing(path):
@@ -53,21 +54,21 @@ def test_a_flipped_bit_is_found_or_changes_nothing(path):
         data[position] ^= 1 << 7
         path.write_bytes(data)
         try:
-            found = load_checkpoint(path)
+            found = load_file(path, KIND)
         except QPError as error:
             refused.append(str(error))
         else:
             assert torch.equal(found["C"], torch.arange(99.0)), position
     assert len(refused) > len(positions) / 4
-    assert all("use another one" in sentence for sentence in refused)
+    assert all("which cannot be read" in sentence for sentence in refused)
 
 
 def test_a_truncated_a_missing_and_another_file_are_named(path):
     data = path.read_bytes()
     for content in (data[: len(data) // 2], data[:-5], b"", b"not a checkpoint"):
         path.write_bytes(content)
-        with pytest.raises(QPError, match=r"checkpoint: .* cannot be read .*another one"):
-            load_checkpoint(path)
+        with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which cannot be read"):
+            load_file(path, KIND)
     path.unlink()
-    with pytest.raises(QPError, match=r"checkpoint: got .*checkpoint.pt, which does not exist"):
-        load_checkpoint(path)
+    with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which does not exist"):
+        load_file(path, KIND)

@@ -22,8 +22,9 @@ from tests.stops import assert_same_numbers, go_on
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment.launch import LOCK, Interrupt, launched, locked
-from torch_qpmpc.experiment.run_folder import load_checkpoint
+from torch_qpmpc.files import load_file
 from torch_qpmpc.learning.replay import Replay
+from torch_qpmpc.mpc.state import KIND
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 HOLD = """
@@ -113,7 +114,7 @@ def test_the_first_signal_is_noted_and_the_second_acts(listening):
         (train, "make_physics", 1, signal.SIGTERM, "before the first update"),
         (Replay, "extend", 1, signal.SIGINT, "before the first update"),
         (Replay, "extend", 4 + 2, signal.SIGTERM, "after update 2"),
-        (train, "save_checkpoint", 1, signal.SIGTERM, "after update 3"),
+        (train, "save_file", 1, signal.SIGTERM, "after update 3"),
     ],
 )
 def test_a_run_stops_cleanly_wherever_the_signal_comes(
@@ -147,7 +148,7 @@ def signal_at(patch: Any, module: Any, name: str, call: int, signum: int, times:
 
 
 def test_a_signal_in_the_last_update_lets_the_run_finish(tmp_path, monkeypatch):
-    signal_at(monkeypatch, train, "save_checkpoint", 2, signal.SIGTERM)
+    signal_at(monkeypatch, train, "save_file", 2, signal.SIGTERM)
     assert train.train(make_config(*RUN), str(tmp_path))["updates"] == 5
 
 
@@ -155,7 +156,7 @@ def test_a_second_ctrl_c_keeps_the_log_and_the_last_checkpoint(tmp_path, monkeyp
     signal_at(monkeypatch, SolveLog, "__enter__", 5, signal.SIGINT, times=2)
     with pytest.raises(KeyboardInterrupt):
         train.train(make_config(*RUN), str(tmp_path))
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 3
+    assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 3
 
 
 def test_one_run_of_a_sweep_leaves_signals_to_its_launcher(tmp_path, monkeypatch, listening):

@@ -16,8 +16,9 @@ import train
 from tests.runs import SMALL, make_config
 from tests.stops import assert_same_numbers, go_on, stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.run_folder import load_checkpoint, save_checkpoint
 from torch_qpmpc.experiment.run_state import resumed
+from torch_qpmpc.files import load_file, save_file
+from torch_qpmpc.mpc.state import KIND
 
 #: The stop is at neither an evaluation nor a row of metrics, and an episode ends after it.
 RUN = (
@@ -102,7 +103,7 @@ def test_the_last_checkpoint_is_enough_to_finish(tmp_path, monkeypatch, whole):
         patch.setattr("train.RunFolder.finish", killed)
         with pytest.raises(KeyboardInterrupt):
             train.train(make_config(*RUN, "eval_interval=2"), str(tmp_path))
-    state = load_checkpoint(tmp_path / "checkpoint.pt")
+    state = load_file(tmp_path / "checkpoint.pt", KIND)
     assert (state["replay"], state["collector"], state["update"]) == (None, None, 8)
     go_on(tmp_path)
     assert_same_numbers(tmp_path, whole)
@@ -132,9 +133,9 @@ def test_only_a_stopped_run_resumes(tmp_path, stopped):
 
 
 def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
-    state = load_checkpoint(stopped / "checkpoint.pt")
+    state = load_file(stopped / "checkpoint.pt", KIND)
     state["config"] |= {"release": None}
-    save_checkpoint(stopped / "checkpoint.pt", state)
+    save_file(stopped / "checkpoint.pt", KIND, state)
     with (stopped / "config.yaml").open("a") as file:
         file.write("release: null\n")
     cfg, state = resumed(stopped, [])
@@ -143,16 +144,16 @@ def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
 
 
 def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
-    whole = load_checkpoint(stopped / "checkpoint.pt")
+    whole = load_file(stopped / "checkpoint.pt", KIND)
     state = {name: part for name, part in whole.items() if name != "config"}
-    save_checkpoint(stopped / "checkpoint.pt", state)
-    with pytest.raises(QPError, match=r"checkpoint: got a dict, .*Another version"):
+    save_file(stopped / "checkpoint.pt", KIND, state)
+    with pytest.raises(QPError, match="checkpoint: got a saved QPMPC, expected a run's state"):
         resumed(stopped, [])
     torch.save([1, 2], stopped / "checkpoint.pt")
-    with pytest.raises(QPError, match=r"checkpoint: got a list, expected a run's state"):
+    with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which another program wrote"):
         resumed(stopped, [])
     cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2")
-    save_checkpoint(stopped / "checkpoint.pt", whole)
+    save_file(stopped / "checkpoint.pt", KIND, whole)
     OmegaConf.save(cfg, stopped / "config.yaml", resolve=True)
     message = (
         r"checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's seed=2"

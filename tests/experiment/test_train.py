@@ -24,8 +24,10 @@ from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.experiment.launch import LOCK, locked
-from torch_qpmpc.experiment.run_folder import load_checkpoint, read_metrics
+from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.files import load_file
 from torch_qpmpc.mpc.layout import Layout, band_distance
+from torch_qpmpc.mpc.state import KIND
 
 
 def run_small(folder: Path, *overrides: str) -> dict[str, Any]:
@@ -38,7 +40,7 @@ metrics: Callable[[Path], Any] = read_metrics
 
 def learned_C(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the learned C - C_0 and the signed distance of its entries from the band."""
-    state = load_checkpoint(folder / "checkpoint.pt")["mpc"]
+    state = load_file(folder / "checkpoint.pt", KIND)["mpc"]
     horizon = state["C_0"].shape[0] // 4
     return (state["C"] - state["C_0"]).numpy(), band_distance(Layout(4, 2, horizon)).numpy()
 
@@ -143,7 +145,7 @@ def test_uneven_intervals_and_steps(tmp_path):
     run_small(tmp_path, *more, "warmup_steps=5")
     assert list(metrics(tmp_path)["eval/J"].dropna().index) == [0, 3, 5]
     assert list(metrics(tmp_path)["loss/value"].dropna().index) == [2, 4]
-    assert load_checkpoint(tmp_path / "checkpoint.pt")["update"] == 5
+    assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 5
 
 
 def test_training_continues_past_unsolved_qps(tmp_path):
@@ -154,7 +156,7 @@ def test_training_continues_past_unsolved_qps(tmp_path):
     assert summary["unsolved"] == table["qp/unsolved"].sum() > 0
     assert table["train/unsolved"].sum() > 0
     assert np.isfinite(table["loss/value"]).all()
-    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    state = load_file(tmp_path / "checkpoint.pt", KIND)["mpc"]
     assert all(value.isfinite().all() for value in state.values())
 
 

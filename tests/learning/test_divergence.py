@@ -13,8 +13,9 @@ import train
 from tests.runs import SMALL, make_config
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, GaussNewton
-from torch_qpmpc.experiment.run_folder import load_checkpoint
+from torch_qpmpc.files import load_file
 from torch_qpmpc.learning.updates import first_order
+from torch_qpmpc.mpc.state import KIND
 
 #: Factors of a thousand and more by which the rates are too large.
 RATES = {
@@ -33,7 +34,7 @@ def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer
     assert summary["J_final"] > summary["J_true_model"], "what it has learned is no good"
     for key in ("J_start", "J_final", "train_cost", "unsolved"):
         assert math.isfinite(summary[key]), key
-    state = load_checkpoint(tmp_path / "checkpoint.pt")["mpc"]
+    state = load_file(tmp_path / "checkpoint.pt", KIND)["mpc"]
     assert not any(value.isnan().any() for value in state.values())
     assert state["C"].isfinite().all()
     table = pd.read_csv(tmp_path / "metrics.csv")

@@ -206,7 +206,7 @@ class LinearMPC(Affine):
         Raises:
             QPError: as in `QPMPC.load`, or the file has no design.
         """
-        content = load_file(path, KIND, "LinearMPC")
+        content = load_file(path, KIND, "LinearMPC.save")
         if "design" not in content:
             remedy = "QPMPC.load reads it."
             raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)

@@ -28,11 +28,11 @@ from torch_qpmpc.experiment.config import (
     settings,
     unknown_key,
 )
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, load_checkpoint, read_summary, unwritable
+from torch_qpmpc.experiment.run_folder import read_summary, unwritable
 from torch_qpmpc.experiment.run_state import (
     check_fresh,
-    check_state,
     configured,
+    load_state,
     resumed,
 )
 from torch_qpmpc.experiment.tasks import run_code
@@ -174,9 +174,7 @@ def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
     """
     folder = Path(folder)
     with contextlib.suppress(QPError):
-        state = load_checkpoint(folder / CHECKPOINT)
-        check_state(state, cfg)
-        return state
+        return load_state(folder, cfg)
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)
     return None
 

@@ -24,9 +24,9 @@ from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.config import differences, load_config, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, load_checkpoint
+from torch_qpmpc.experiment.run_folder import CHECKPOINT
 from torch_qpmpc.experiment.tasks.code import COMMAND, has_run, named_code, resume_arguments
-from torch_qpmpc.files import labelled
+from torch_qpmpc.files import load_file
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.state import KIND, stored
@@ -44,7 +44,7 @@ def snapshot(
     replay: Replay,
     tally: Tally,
 ) -> dict[str, Any]:
-    """Return the state of a run between two updates, for `checkpoint.save_checkpoint`.
+    """Return the state of a run between two updates, a file of the `KIND` of a QPMPC.
 
     After the last update the replay and the collector's state are left out.
     """
@@ -52,7 +52,7 @@ def snapshot(
     return {
         "config": settings(cfg),
         "update": tally.update,
-        **labelled(KIND, stored(mpc)),  # so that QPMPC.load reads a checkpoint, too
+        **stored(mpc),  # so that QPMPC.load reads a checkpoint, too
         "loss_module": learner.loss_module.state_dict(),
         "optimizer": learner.optimizer.state_dict(),
         "scheduler": {"last_epoch": learner.scheduler.last_epoch},
@@ -98,17 +98,18 @@ def restore(
     return tally
 
 
-def check_state(state: Any, cfg: DictConfig) -> None:
-    """Raise `QPError` unless ``state`` is a `snapshot` of a run with the configuration ``cfg``."""
-    remedy = "Another version of train.py wrote it: resume with that version, or start a new run."
-    if not isinstance(state, dict) or "config" not in state:
-        raise QPError.expected("checkpoint", f"a {type(state).__name__}", "a run's state", remedy)
+def load_state(folder: Path, cfg: DictConfig) -> dict[str, Any]:
+    """Load the last `snapshot` of the run in a folder, which has the configuration ``cfg``."""
+    state = load_file(folder / CHECKPOINT, KIND, "train.py")
+    if "config" not in state:
+        raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
     if changed := differences(state["config"], settings(cfg)):
         then, now = changed
         remedy = "A run resumes with its own configuration, from its own checkpoints."
         raise QPError.expected(
             "checkpoint", f"one from a run with {then}", f"config.yaml's {now}", remedy
         )
+    return state
 
 
 def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
@@ -142,11 +143,7 @@ def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
     if (path / "summary.json").exists():
         raise QPError.expected("resume", f"{path}, which is finished", "a stopped run")
     cfg = load_config(config)
-    if not (path / CHECKPOINT).exists():
-        return cfg, None
-    state = load_checkpoint(path / CHECKPOINT)
-    check_state(state, cfg)
-    return cfg, state
+    return cfg, load_state(path, cfg) if (path / CHECKPOINT).exists() else None
 
 
 def configured(path: str | Path) -> Path:
