@@ -81,8 +81,8 @@ def test_metrics_of_a_C_that_cannot_be_read_are_nan(value):
     mpc = scheme()
     with torch.no_grad():
         mpc.C[:, -1] = value
-    metrics = structure_metrics(mpc, (A, B))
-    assert len(metrics) == 4
+    metrics = structure_metrics(mpc)
+    assert len(metrics) == 3
     assert all(math.isnan(number) for number in metrics.values())
     with pytest.raises(QPError, match=r"^C"):
         read(mpc)

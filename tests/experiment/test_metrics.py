@@ -12,10 +12,9 @@ from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.evaluation import Evaluation, closed_gap
-from torch_qpmpc.experiment.metrics import report, structure_summary, table, theta_metrics
+from torch_qpmpc.experiment.metrics import report, table, theta_metrics
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.mpc.layout import banded_matrix
 
 
 def evaluation(start: float, learned: float, true: float, **rivals: float) -> Evaluation:
@@ -57,34 +56,6 @@ def test_the_numbers_of_theta_are_logged_where_they_are_few():
     free = make_config("constraint=free")
     names = {f"theta/H_{i}" for i in range(6)} | {"theta/c"}
     assert set(theta_metrics(make_mpc(free, make_physics(free)))) == names
-
-
-def test_structure_summary_has_the_models_error_before_and_after():
-    cfg = make_config(*SMALL, "constraint=free")
-    physics = linear_system(cfg)
-    mpc = make_mpc(cfg, physics)
-    truth = physics.true_model()
-    assert truth is not None
-    A, B, offset = truth
-    before = (mpc.C_0[:4, :6] - torch.cat((A, B), dim=1)).norm().item()
-    expected = {"canonical_distance": 0, "model_error": before, "model_error_start": before}
-    assert structure_summary(mpc, (A, B, offset)) == pytest.approx(expected, abs=1e-9)
-    with torch.no_grad():
-        mpc.C.copy_(2 * banded_matrix(A, B, cfg.task.horizon))
-    after = expected | {"model_error": 0}
-    assert structure_summary(mpc, (A, B, offset)) == pytest.approx(after, abs=1e-9)
-
-
-def test_a_run_continues_if_its_C_cannot_be_read():
-    cfg = make_config(*SMALL, "constraint=free")
-    physics = linear_system(cfg)
-    mpc = make_mpc(cfg, physics)
-    with torch.no_grad():
-        mpc.C.zero_()
-    summary = structure_summary(mpc, physics.true_model())
-    assert math.isnan(summary["canonical_distance"])
-    assert math.isnan(summary["model_error"])
-    assert summary["model_error_start"] > 0
 
 
 def test_report_logs_the_evaluation(tmp_path):

@@ -160,24 +160,18 @@ def read(
 
 
 @without_gradients
-def structure_metrics(mpc: QPMPC, true_model: Sequence[Tensor] | None = None) -> dict[str, float]:
+def structure_metrics(mpc: QPMPC) -> dict[str, float]:
     """Return the numbers of `read` that measure the distance to an MPC scheme, for logs.
 
     All are nan if C has no prediction form, so that training continues.
     """
     check_kind("mpc", mpc, QPMPC)
-    true = None if true_model is None else _checked_model(mpc, true_model)
     names = ("causality_defect", "toeplitz_defect", "distance_to_mpc")
-    names += () if true is None else ("model_error",)
     try:
         form = predictions(mpc)
     except QPError:
         return dict.fromkeys(names, math.nan)
-    nearest = nearest_model(form)
-    values = [causality_defect(form), toeplitz_defect(form), nearest.residual]
-    if true is not None:
-        A, B, offset, E = true
-        values.append(one_step_error(nearest, A, B, offset, E=E))
+    values = causality_defect(form), toeplitz_defect(form), nearest_model(form).residual
     return dict(zip(names, map(float, values), strict=True))
 
 

@@ -14,13 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_qpmpc.analysis.report import structure_metrics
-from torch_qpmpc.analysis.structure import (
-    distance_by_band,
-    nearest_model,
-    one_step_error,
-    prediction_form,
-)
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.analysis.structure import distance_by_band
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation, cost_text, gap_text
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
@@ -129,8 +123,7 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     physics = evaluation.physics
     if raised := getattr(physics, "raised", None):
         summary |= {"raised": len(raised), "first_raised": raised[0]}
-    model = physics.true_model() if isinstance(physics, LinearSystem) else None
-    return summary | structure_summary(mpc, model)
+    return summary | {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
 
 
 def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> dict[str, Any]:
@@ -153,20 +146,6 @@ def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation) -> None:
     summary.savefig(run.path / "summary.png", dpi=110)
     if evaluation.loops["learned"].known.isfinite().all():
         learned_episode_figure(mpc, evaluation).savefig(run.path / "episode.png", dpi=110)
-
-
-def structure_summary(mpc: QPMPC, true_model: Sequence[Tensor] | None) -> dict[str, float]:
-    """Measure the distance of the learned constraints from an MPC scheme and the true model."""
-    if true_model is None:
-        return {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
-    metrics = structure_metrics(mpc, true_model)
-    start = nearest_model(prediction_form(mpc.C_0, mpc.n_x, mpc.n_u, n_d=mpc.n_d))
-    A, B, offset, *E = true_model
-    return {
-        "canonical_distance": metrics["distance_to_mpc"],
-        "model_error": metrics["model_error"],
-        "model_error_start": one_step_error(start, A, B, offset, E=E[0] if E else None).item(),
-    }
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:
