@@ -11,13 +11,14 @@ from tests.envs.test_kalman_filter import model
 from tests.rollouts import Staggered, collected, network_policy
 from tests.store import Store
 from torch_qpmpc.envs import PlantEnv
+from torch_qpmpc.envs.plant import EPISODES
 from torch_qpmpc.errors import QPError
 
 PLANT = Store(horizon=3)
 
 
-def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0, **options: Any) -> Any:
-    return PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed, **options)
+def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0) -> Any:
+    return PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed)
 
 
 class StaggeredEnv(Staggered, PlantEnv):
@@ -35,12 +36,12 @@ def test_sizes_are_those_of_what_a_controller_sees():
 
 
 def test_transitions_follow_the_plant():
-    env = make_env(seed=11, episodes=5)
+    env = make_env(seed=11)
     data = env.rollout(6, network_policy(env))
     rng = torch.Generator().manual_seed(11)
-    signals = PLANT.signals(rng, 5, 6 + PLANT.horizon + 1)
+    signals = PLANT.signals(rng, EPISODES, 6 + PLANT.horizon + 1)
     x = PLANT.starts(rng, 4)
-    w = signals[torch.randint(5, (4,), generator=rng)]
+    w = signals[torch.randint(EPISODES, (4,), generator=rng)]
     for k in range(6):
         now, u = data[:, k], PLANT.applied(data[:, k]["action"])
         assert torch.equal(now["state"], x)
@@ -80,8 +81,6 @@ def test_partial_resets_restart_exactly_the_finished_episodes():
 
 
 def test_bad_arguments_are_an_error():
-    with pytest.raises(QPError, match="episodes: got 0, expected a whole number >= 1"):
-        PlantEnv(PLANT, 1, 5, episodes=0)
     with pytest.raises(QPError, match="plant: got int, expected a Plant"):
         PlantEnv(3, 1, 5)  # pyright: ignore[reportArgumentType]
     with pytest.raises(QPError, match="n_y: got 0, expected a whole number >= 1"):

@@ -24,7 +24,7 @@ from torch_qpmpc.envs.linear_system import Rng, moved
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.mpc.innovations import Innovations
 
-#: The default number of different episodes of signals.
+#: The number of different episodes of signals.
 EPISODES = 1024
 
 
@@ -117,12 +117,11 @@ class PlantEnv(VectorisedEnv):
 
     It emits the output y as ``observation`` ``(num_envs, n_y)``, and the known signals d_k, ..,
     d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The seed draws the signals
-    of ``episodes`` episodes; each reset chooses one of them at random.
+    of `EPISODES` episodes; each reset chooses one of them at random.
 
     Args:
         plant: the plant.
         num_envs, max_steps, dtype, device, seed: as in `VectorisedEnv`.
-        episodes: number of different episodes of signals.
 
     Raises:
         QPError: an argument does not fit.
@@ -136,13 +135,10 @@ class PlantEnv(VectorisedEnv):
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
         seed: int | None = None,
-        episodes: int = EPISODES,
     ) -> None:
         check_kind("plant", plant, Plant)
-        check_whole("episodes", episodes, 1)
         super().__init__(num_envs, max_steps, dtype, device, seed)
         self.plant = p = plant.to(self.device)
-        self.episodes = episodes
         n_x = p.starts(torch.Generator(device=self.rng.device), 1).shape[-1]
         observed = {"observation": self._reals(p.n_y)}
         if p.n_d:
@@ -153,13 +149,13 @@ class PlantEnv(VectorisedEnv):
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
         length = self.max_steps + self.plant.horizon + 1
-        self._signals = self.plant.signals(self.rng, self.episodes, length)
+        self._signals = self.plant.signals(self.rng, EPISODES, length)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         # Reset every environment: at a partial reset, TorchRL keeps the old values of the others.
         x = self.plant.starts(self.rng, self.batch_size[0])
         count = self._zero_count()
-        episode = torch.randint(self.episodes, count.shape, generator=self.rng, device=count.device)
+        episode = torch.randint(EPISODES, count.shape, generator=self.rng, device=count.device)
         return self._observed(x, episode, count)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
