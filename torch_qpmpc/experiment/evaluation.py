@@ -40,24 +40,16 @@ def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
     return (J_start - J_final) / gap if gap > 0 else math.nan
 
 
-def gap_text(
-    gap: float, J_start: float, J_final: float, J_true_model: float, name: str = "J"
-) -> str:
-    """Return a closed gap to three decimals or, if it is nan, the reason and the change of J.
+def gap_text(gap: float, J_true_model: float) -> str:
+    """Return a closed gap to three decimals or, if it is nan, the reason.
 
     Example:
-        >>> gap_text(math.nan, 50.0, 62.3, 50.0)
-        'no gap; J rose by 12.30'
+        >>> gap_text(math.nan, 50.0)
+        'no gap'
     """
-    if not math.isnan(gap):
-        return f"{gap:.3f}"
-    reason = "no true model" if math.isnan(J_true_model) else "no gap"
-    change = J_final - J_start
-    if not math.isfinite(change):
-        return f"{reason}; {name} went from {cost_text(J_start)} to {cost_text(J_final)}"
-    if cost_text(J_start) == cost_text(J_final):
-        return f"{reason}; {name} did not change"
-    return f"{reason}; {name} {'rose' if change > 0 else 'fell'} by {cost_text(abs(change))}"
+    if math.isnan(gap):
+        return "no true model" if math.isnan(J_true_model) else "no gap"
+    return f"{gap:.3f}"
 
 
 def cost_text(J: float) -> str:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import pandas as pd
 from numba.core.event import install_timer
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -160,21 +161,18 @@ def theta_metrics(mpc: QPMPC) -> dict[str, float]:
 
 def table(summary: Mapping[str, Any]) -> str:
     """Format the outcome for the terminal."""
-    rows = [["", "start", "learned", "true model", "closed gap"]]
+    rows = {}
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
         start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "best", "true_model"))
-        gap = summary[f"closed_gap{tag.removeprefix('J')}"]
-        share = gap_text(gap, start, final, true, name)
-        rows.append([name, *map(cost_text, (start, final, true)), share])
-    least = zip((0, 10, 10, 12), zip(*rows, strict=True), strict=False)
-    a, b, c, d = (max(n, 2 + max(map(len, column))) for n, column in least)
-    lines = [f"{x[0]:{a}}{x[1]:>{b}}{x[2]:>{c}}{x[3]:>{d}}  {x[4]:>10}" for x in rows]
+        share = gap_text(summary[f"closed_gap{tag.removeprefix('J')}"], true)
+        rows[name] = [*map(cost_text, (start, final, true)), share]
+    head = ["start", "learned", "true model", "closed gap"]
+    lines = [pd.DataFrame.from_dict(rows, orient="index", columns=head).to_string(col_space=10)]
     episodes, steps = summary["episodes"], summary["episode_steps"]
     lines.append(f"Mean cost of {episodes:,} episodes of at most {steps:,} steps")
     if rivals := summary["rivals"]:
-        width = max(map(len, rivals))
-        lines += ["", "J of the rivals"]
-        lines += [f"  {name:{width}}  {cost_text(J):>8}" for name, J in rivals.items()]
+        costs = pd.Series(rivals).map(cost_text)
+        lines += ["", "J of the rivals", costs.to_string(header=False)]
     if summary.get("rejected") and not summary["accepted"]:
         kept = f"none of {summary['rejected']} candidates was shown to cost less"
         kept += f", the last one of which costs {cost_text(summary['J_final'])}"
