@@ -81,7 +81,7 @@ DIFFERENTIATED: dict[str, tuple[Callable[[Tensor], Tensor], Any]] = {
         lambda t: linear().value(linear().arrange([1.0, 0.5], target()._replace(x=t))),
         [0.3, 0.0],
     ),
-    "DeviationPenalty C": (lambda t: qm.DeviationPenalty.of(scheme())(t), scheme().C_0 + 0.1),
+    "DeviationPenalty C": (lambda t: qm.DeviationPenalty(scheme())(t), scheme().C_0 + 0.1),
     "target r": (lambda t: linear().target(t).y, [0.3, 0.0]),
     "nearest_psd H": (nearest_psd, [[1.0, 2.0], [2.0, 1.0]]),
     "spectral_radius A": (lambda t: spectral_radius(t, *GAIN), A),
@@ -149,7 +149,6 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "centres": (
         lambda t: BlendedModel(t, [0.0] * 2, [1.0] * 2, 1.0, [A], [B], [[0.0] * 2]), [[0.0] * 2]
     ),
-    "C_0": (lambda t: qm.DeviationPenalty(t, 2, 1), scheme().C_0),
     "s": (lambda t: local_gain(scheme(), t), [[1.0, 0.5]]),
     "observation": (scheme().predict, [[1.0, 0.5]]),
     "covariances": (lambda t: tighten(model(), t), [[[0.1, 0.0], [0.0, 0.1]]] * 6),

@@ -48,7 +48,7 @@ S, Aa, V = zeros(4, 2), zeros(4, 1), zeros(4)
 WEIGHTS = tensor([1.0, nan, 1.0])
 TD = partial(TensorDict, batch_size=4)
 op, gn = make_operator(), qm.GaussNewton(random_mpc(0))
-deviation, si = qm.DeviationPenalty(mpc.C_0, 2, 1), qm.SystemIdentificationPenalty()
+deviation, si = qm.DeviationPenalty(mpc), qm.SystemIdentificationPenalty()
 form = prediction_form(banded_matrix(A2, B1, 4), 2, 1)
 pair = prediction_form(torch.stack([mpc.C_0] * 2), 2, 1)
 model, pm = nearest_model(form), PointMass()
@@ -174,10 +174,8 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("s: got shape (2, 2, 2)", lambda: gn.step(zeros(2, 2, 2), zeros(2, 2, 1), zeros(2, 2))),
     ("mpc: got a QPMPC with new parameters of C, expected the parameters of this", released_step),
     ("s: got an empty batch, expected at least one", lambda: gn.step(S[:0], Aa[:0], zeros(0))),
-    ("n_x: got 0, expected a whole number >= 1.", lambda: qm.DeviationPenalty(mpc.C_0, 0, 1)),
     ("C: got shape (11,), expected shape (6, 11). Pass mpc.C.", lambda: deviation(mpc.C[0])),
-    ("C_0: got shape (11,), expected shape (N n_x,", lambda: qm.DeviationPenalty(mpc.C_0[0], 2, 1)),
-    ("C_0: got NaN or inf, expected finite", lambda: qm.DeviationPenalty(mpc.C_0 * nan, 2, 1)),
+    ("mpc: got Parameter, expected a QPMPC.", lambda: qm.DeviationPenalty(mpc.C)),
     ("scale: got -1.0, expected a finite", lambda: deviation.proximal_step_(random_mpc(0).C, -1.0)),
     ("windows: got shape (11, 6), expected shape (M, 11).", lambda: si(zeros(5, 11), mpc.C.mT)),
     ("C: got QPMPC, expected a floating-point torch.Tensor.", lambda: si(mpc, zeros(1, 11))),

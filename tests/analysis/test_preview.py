@@ -164,10 +164,8 @@ def test_the_band_of_a_preview():
         ]
     )
     weights = {"c_1": a, "c_2": o, "c_3": b}
-    penalty = DeviationPenalty(torch.zeros(3, 11), 1, 1, n_d=1, **weights)
-    assert torch.equal(penalty.C_mask, expected)
     mpc = QPMPC.of(1, 1, 3, n_d=1)
-    assert torch.equal(DeviationPenalty.of(mpc, **weights).C_mask, expected.double())
+    assert torch.equal(DeviationPenalty(mpc, **weights).C_mask, expected.double())
     with torch.no_grad():
         mpc.C += torch.arange(33).view(3, 11)
     found = distance_by_band(mpc)
@@ -217,10 +215,6 @@ def test_figures_are_drawn_and_labelled():
         (
             lambda: canonical_matrix(model(), torch.zeros(N, N_X, 1)),
             r"A: got shape \(5, 2, 1\), expected shape \(5, 2, 2\)",
-        ),
-        (
-            lambda: DeviationPenalty(torch.zeros(3, 11), 1, 1, n_d=-1),
-            "n_d: got -1, expected a whole number >= 0",
         ),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torch_qpmpc import DeviationPenalty, QPError, SystemIdentificationPenalty
+from torch_qpmpc import QPMPC, DeviationPenalty, QPError, SystemIdentificationPenalty
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.mpc.layout import banded_matrix
 
@@ -26,8 +26,9 @@ def normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
-def make_C_0(generator: torch.Generator) -> torch.Tensor:
-    return banded_matrix(normal(generator, N_X, N_X), normal(generator, N_X, N_U), N)
+def make_mpc(generator: torch.Generator) -> QPMPC:
+    A, B = normal(generator, N_X, N_X), normal(generator, N_X, N_U)
+    return QPMPC.of(N_X, N_U, N, A=A, B=B)
 
 
 # --- Deviation -----------------------------------------------------------------------------------
@@ -37,20 +38,21 @@ def test_mask_is_the_printed_one():
     """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
     a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
     scalar = torch.tensor([[o, o, o, a, a, a, a], [b, b, o, o, o, a, a], [b, b, b, b, o, o, o]])
-    penalty = DeviationPenalty(torch.zeros(3, 7), 1, 1, c_1=a, c_2=o, c_3=b)
+    penalty = DeviationPenalty(QPMPC.of(1, 1, 3), c_1=a, c_2=o, c_3=b)
     assert torch.equal(penalty.C_mask, scalar)
 
     n_x, n_u = 4, 2
     widths = torch.tensor([n_x, n_u] * 3 + [n_x])
     blocks = scalar.repeat_interleave(n_x, dim=0).repeat_interleave(widths, dim=1)
-    penalty = DeviationPenalty(torch.zeros(blocks.shape), n_x, n_u, c_1=a, c_2=o, c_3=b)
+    penalty = DeviationPenalty(QPMPC.of(n_x, n_u, 3), c_1=a, c_2=o, c_3=b)
     assert torch.equal(penalty.C_mask, blocks)
 
 
 def test_deviation_penalty_entry_by_entry(generator):
-    C_0 = make_C_0(generator)
+    mpc = make_mpc(generator)
+    C_0 = mpc.C_0
     C = C_0 + normal(generator, *C_0.shape)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=2.0, c_2=0.5, c_3=0.25)
+    penalty = DeviationPenalty(mpc, c_1=2.0, c_2=0.5, c_3=0.25)
     mask = penalty.C_mask
     total = sum(
         abs(mask[i, j] * (C[i, j] - C_0[i, j])).item()
@@ -62,8 +64,9 @@ def test_deviation_penalty_entry_by_entry(generator):
 
 
 def test_deviation_penalty_has_the_right_gradient(generator):
-    C_0 = make_C_0(generator)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=2.0, c_2=0.5, c_3=0.25)
+    mpc = make_mpc(generator)
+    C_0 = mpc.C_0
+    penalty = DeviationPenalty(mpc, c_1=2.0, c_2=0.5, c_3=0.25)
     C = (C_0 + normal(generator, *C_0.shape)).requires_grad_()
     assert torch.autograd.gradcheck(penalty, C, atol=1e-7)
     (gradient,) = torch.autograd.grad(penalty(C), C)
@@ -73,8 +76,9 @@ def test_deviation_penalty_has_the_right_gradient(generator):
 @pytest.mark.parametrize("scale", [1.0, 0.3])
 def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
     """Against a search over a fine grid, and over the kink, for every entry."""
-    C_0 = make_C_0(generator)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.2, c_3=0.0)
+    mpc = make_mpc(generator)
+    C_0 = mpc.C_0
+    penalty = DeviationPenalty(mpc, c_1=1.0, c_2=0.2, c_3=0.0)
     start = C_0 + normal(generator, *C_0.shape)
     C = torch.nn.Parameter(start.clone())
     penalty.proximal_step_(C, scale)
@@ -95,8 +99,9 @@ def test_proximal_step_is_the_minimiser_entry_by_entry(generator, scale):
 
 
 def test_proximal_step_reaches_C_0_exactly(generator):
-    C_0 = make_C_0(generator)
-    penalty = DeviationPenalty(C_0, N_X, N_U, c_1=1.0, c_2=0.01, c_3=0.0)
+    mpc = make_mpc(generator)
+    C_0 = mpc.C_0
+    penalty = DeviationPenalty(mpc, c_1=1.0, c_2=0.01, c_3=0.0)
     start = C_0 + 0.1 * normal(generator, *C_0.shape)
     C = torch.nn.Parameter(start.clone())
     pointer = C.data_ptr()
@@ -118,13 +123,7 @@ def test_proximal_step_reaches_C_0_exactly(generator):
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
 def test_impossible_deviation_weights(name, weight):
     with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):
-        DeviationPenalty(torch.zeros(3, 7), 1, 1, **{name: weight})
-
-
-@pytest.mark.parametrize(("shape", "horizon"), [((3, 8), 1), ((5, 8), 2), ((6, 3), 3)])
-def test_C_0_of_no_horizon(shape, horizon):
-    with pytest.raises(QPError, match=rf"C_0: got shape \({shape[0]}, .* for N = {horizon}"):
-        DeviationPenalty(torch.zeros(shape), 2, 1)
+        DeviationPenalty(QPMPC.of(1, 1, 3), **{name: weight})
 
 
 # --- System identification -----------------------------------------------------------------------

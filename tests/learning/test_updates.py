@@ -118,7 +118,7 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
 
 def test_a_second_order_update_without_a_usable_pair_moves_nothing():
     mpc = random_mpc(3)
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
+    deviation = DeviationPenalty(mpc, c_2=1e-2, c_3=1e-2)
     batch, before = transitions(), copy.deepcopy(mpc.state_dict())
     batch["next", "reward"][:] = torch.inf
     update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), deviation, None)
@@ -136,7 +136,7 @@ def test_a_second_order_update_without_a_usable_pair_moves_nothing():
 @pytest.mark.parametrize("cause", ["reward", "action"])
 def test_a_first_order_update_without_a_usable_transition_moves_nothing(cause):
     mpc = random_mpc(3, on_failure="mask")
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-2, c_3=1e-2)
+    deviation = DeviationPenalty(mpc, c_2=1e-2, c_3=1e-2)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     optimizer = torch.optim.Adam(mpc.parameter_groups(RATES), weight_decay=0.1)
     update = first_order(mpc, make_loss(mpc), optimizer, deviation, si)
@@ -173,7 +173,7 @@ def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty):
 )
 def test_the_proximal_step_holds_entries_above_the_band_at_zero(optimizer, rule):
     mpc = random_mpc(3, free=0.0, step=rule)
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_2=1e-5)
+    deviation = DeviationPenalty(mpc, c_2=1e-5)
     update, _ = make_update(optimizer, mpc, deviation)
     for seed in range(5):
         update(transitions(seed=seed), None)
@@ -185,7 +185,7 @@ def test_the_proximal_step_holds_entries_above_the_band_at_zero(optimizer, rule)
 
 def test_a_gradient_step_with_its_proximal_step_is_the_papers():
     mpc = random_mpc(3)
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u, c_1=1e-2, c_2=1e-4)
+    deviation = DeviationPenalty(mpc, c_1=1e-2, c_2=1e-4)
     twin = copy.deepcopy(mpc)
     make_update("sgd", mpc, deviation)[0](transitions(), None)
     make_loss(twin, td_error_clip=1.0)(transitions())["loss_value"].backward()
@@ -205,7 +205,7 @@ def test_a_gradient_step_with_its_proximal_step_is_the_papers():
 @pytest.mark.parametrize("optimizer", ["sgd", "adam", "gauss_newton"])
 def test_the_penaltys_weight_falls_with_the_rate_of_C(optimizer):
     mpc = random_mpc(3)
-    deviation = DeviationPenalty(mpc.C_0, mpc.n_x, mpc.n_u)
+    deviation = DeviationPenalty(mpc)
     _, made = make_update(optimizer, mpc, deviation)
     assert share_of_rate(made) == 1, "without a schedule"
     schedule, shares = LambdaLR(made, lambda update: 1 / (1 + update)), []

@@ -81,7 +81,7 @@ def test_the_proximal_step_of_an_update_leaves_frozen_entries():
     loss = QPQLearningLoss(QPActorValueOperator(mpc))
     loss.make_value_estimator(gamma=0.9)
     groups = mpc.parameter_groups({"cost": 0.0, "constraints": 0.0})
-    penalty = DeviationPenalty(mpc.C_0, 2, 1, c_1=0.1, c_2=0.1, c_3=0.1)
+    penalty = DeviationPenalty(mpc, c_1=0.1, c_2=0.1, c_3=0.1)
     update = first_order(mpc, loss, torch.optim.SGD(groups, lr=0.0), penalty, None)
     C = mpc.C.detach().clone()
     update(make_batch(4), None)
@@ -240,7 +240,7 @@ def test_the_state_of_another_qpmpcs_loss_is_refused():
 
 def test_a_masked_C_is_not_tied():
     mpc = masked(rows())
-    penalty = DeviationPenalty(mpc.C_0, 2, 1)
+    penalty = DeviationPenalty(mpc)
     with pytest.raises(QPError, match=r"pass mpc.leaves\('C'\)\[0\]"):
         penalty.proximal_step_(mpc.C)
     with pytest.raises(QPError, match="part: got 'b', expected one of the learned parts: H, c, C"):

@@ -143,7 +143,7 @@ def make_penalties(
     """Make the deviation and the SI penalty; None for each that is off."""
     deviation, si = cfg.constraint.deviation, cfg.constraint.si
     return (
-        None if deviation is None else DeviationPenalty.of(mpc, **deviation),
+        None if deviation is None else DeviationPenalty(mpc, **deviation),
         None if si is None else SystemIdentificationPenalty(si.beta),
     )
 

@@ -412,7 +412,7 @@ def improve(
         cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
             plant; by default the `stage_cost` of the scheme.
         penalty: maps ``mpc`` to a term that is added to the mean cost of a step, such as
-            ``lambda mpc: DeviationPenalty.of(mpc)(mpc.C)``.
+            ``lambda mpc: DeviationPenalty(mpc)(mpc.C)``.
         seed: seeds the models and the loops.
 
     Raises:

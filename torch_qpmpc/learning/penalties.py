@@ -10,11 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_number, check_tensor
+from torch_qpmpc.checks import check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.layout import Layout, band_distance
+from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import ungraded
 
 WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
 
@@ -30,21 +29,18 @@ class DeviationPenalty(nn.Module):
     Markovian.
 
     Args:
-        C_0: the banded matrix, ``(N n_x, n_z)``.
-        n_x: number of states.
-        n_u: number of actions.
-        n_d: entries of d_k, as in `QPMPC`.
+        mpc: the QPMPC, which has C_0 ``(N n_x, n_z)``.
         c_1: weight above the band, where the future would act on the past.
         c_2: weight on the band.
         c_3: weight below the band.
 
     Raises:
-        QPError: if a weight is negative or not finite, or the shape of C_0 fits no horizon.
+        QPError: if ``mpc`` is no QPMPC, or a weight is negative or not finite.
 
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> mpc = qm.QPMPC.from_model(torch.eye(1), torch.eye(1), 3, stage_weight=[1.0, 0.1])
-        >>> penalty = qm.DeviationPenalty.of(mpc)
+        >>> penalty = qm.DeviationPenalty(mpc)
         >>> penalty(mpc.C).item()
         0.0
     """
@@ -53,41 +49,16 @@ class DeviationPenalty(nn.Module):
     C_mask: Tensor
 
     def __init__(
-        self,
-        C_0: Tensor,
-        n_x: int,
-        n_u: int,
-        n_d: int = 0,
-        *,
-        c_1: float = 1.0,
-        c_2: float = 1e-4,
-        c_3: float = 0.0,
+        self, mpc: QPMPC, *, c_1: float = 1.0, c_2: float = 1e-4, c_3: float = 0.0
     ) -> None:
         super().__init__()
+        check_kind("mpc", mpc, QPMPC)
         for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
             check_number(name, weight, _finite, "a finite weight >= 0")
-        remedy = "Pass the C_0 of a QPMPC."
-        check_tensor("C_0", ungraded("C_0", C_0), "N n_x", "n_z", batched=False, remedy=remedy)
-        if not C_0.isfinite().all():
-            raise QPError.expected("C_0", "NaN or inf", "finite entries", remedy)
-        horizon = max(len(C_0) // max(n_x, 1), 1)
-        distance = band_distance(Layout(n_x, n_u, horizon, n_d)).to(C_0)
-        if distance.shape != C_0.shape:
-            want = f"shape {tuple(distance.shape)} for N = {horizon}"
-            raise QPError.expected("C_0", f"shape {tuple(C_0.shape)}", want)
-        mask = torch.full_like(distance, c_2)
+        distance, mask = band_distance(mpc.layout).to(mpc.C_0), torch.full_like(mpc.C_0, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
-        self.register_buffer("C_0", C_0.detach().clone())
+        self.register_buffer("C_0", mpc.C_0.detach().clone())
         self.register_buffer("C_mask", mask)
-
-    @classmethod
-    def of(cls, mpc: QPMPC, **weights: float) -> DeviationPenalty:
-        """Return the penalty for the C of ``mpc``; ``weights`` are c_1, c_2 and c_3.
-
-        Raises:
-            QPError: as in `DeviationPenalty`.
-        """
-        return cls(mpc.C_0, mpc.n_x, mpc.n_u, mpc.n_d, **weights)
 
     def forward(self, C: Tensor) -> Tensor:
         """Return the penalty of C ``(N n_x, n_z)``, a scalar."""
