@@ -48,11 +48,9 @@ class StructureReport:
         distance_to_mpc: relative distance of the predictions to those of ``nearest``.
         gain_to_lqr: ``||K - K_lqr|| / ||K_lqr||`` with K's part for x, or nan.
         radius_predicted: spectral radius of the nearest model's A - B K.
-        radius: spectral radius of the true A - B K; nan without a true model, as are the next.
+        radius: spectral radius of the true A - B K; nan without a true model, as is the next.
         model_error: `one_step_error` of ``nearest`` against the true model, with (s, a) of unit
             variance.
-        model_error_max: largest difference of an entry of A, B or E.
-        first_stage_error: ``model_error`` of A_0, B_0, E_0.
     """
 
     form: PredictionForm = field(repr=False)
@@ -69,8 +67,6 @@ class StructureReport:
     radius_predicted: float
     radius: float
     model_error: float
-    model_error_max: float
-    first_stage_error: float
 
     def scalars(self) -> dict[str, float]:
         """Return the numbers by name."""
@@ -129,16 +125,13 @@ def read(
         K_lqr = lqr_gain(nearest.A, nearest.B, stage_weight(mpc), mpc.gamma)
     except QPError:
         K_lqr = None
-    radius = error = largest = first = gain_error = math.nan
+    radius = error = gain_error = math.nan
     if K_lqr is not None:
         gain_error = ((K_x - K_lqr).norm() / K_lqr.norm()).item()
     if true is not None:
         A, B, offset, E = true
         radius = spectral_radius(A, B, K_x).item()
         error = one_step_error(nearest, A, B, offset, E=E).item()
-        pairs = ((nearest.A, A), (nearest.B, B), (nearest.E, E))
-        largest = max((own - part).abs().max().item() for own, part in pairs if part.numel())
-        first = one_step_error(stages, A, B, offset, E=E)[0].item()
     return StructureReport(
         form=form,
         nearest=nearest,
@@ -154,8 +147,6 @@ def read(
         radius_predicted=spectral_radius(nearest.A, nearest.B, K_x).item(),
         radius=radius,
         model_error=error,
-        model_error_max=largest,
-        first_stage_error=first,
     )
 
 
