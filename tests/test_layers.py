@@ -29,12 +29,12 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder; `.` is the package's own files.
 BUDGET = {
     ".": 394,
-    "analysis": 866,
-    "control": 4320,
-    "envs": 1428,
-    "experiment": 3170,
+    "analysis": 851,
+    "control": 4295,
+    "envs": 1394,
+    "experiment": 3107,
     "export": 1244,
-    "learning": 2798,
+    "learning": 2769,
     "mpc": 5014,
     "proofs": 999,
     "qp": 5622,
