@@ -38,6 +38,7 @@ from torch_qpmpc.experiment.logs import estimated
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.learning.closed_loop import ensemble
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.riccati import terminal_riccati
@@ -289,6 +290,32 @@ class Swing(Lag):
         self.rate = 0.97 * self.rate - 0.3 * self.y + 0.5 * action
         self.y = self.y + 0.3 * self.rate
         return self.y, -(self.y.item() ** 2), False, False, {}
+
+
+class Stocked(Swing):
+    """A swing whose cost is that of a stock, which no output shows and the inputs fill."""
+
+    def reset(self, *, seed=None, options=None):
+        self.stock = 0.0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        cost = (self.stock + action.item()) ** 2
+        self.stock = 0.96 * self.stock + 0.3 * action.item()
+        return super().step(action)[0], -cost, False, False, {}
+
+
+def test_a_cost_of_a_state_that_no_output_shows_is_one_of_smoothed_inputs(monkeypatch):
+    plant_is(monkeypatch, Stocked)
+    cfg = make_config(*DATA)
+    physics: Any = make_physics(cfg)
+    named = candidates(cfg, physics, collect_log(cfg, physics))
+    start, outputs = named[ESTIMATE], named[OUTPUTS]
+    assert start.cost.R2 > 0.98 > 0.8 > outputs.cost.R2
+    assert start.found.fit.pole == 1 - 0.5**5
+    models = ensemble(start.found, 2, seed=0)
+    assert [len(model.A) for model in models] == [len(start.model.A)] * 2
+    assert (models[1].A[-2:, -2:] == start.model.A[-2:, -2:]).all()
 
 
 @pytest.fixture

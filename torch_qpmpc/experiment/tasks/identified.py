@@ -34,12 +34,15 @@ from torch_qpmpc.mpc.riccati import (
     terminal_riccati,
 )
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.stage_cost import GOOD, StageCost, fit_rewards, poor, scheme_cost
+from torch_qpmpc.mpc.stage_cost import GOOD, LEFT, StageCost, fit_rewards, missed, poor, scheme_cost
 from torch_qpmpc.mpc.subspace import fit_state_space
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 if TYPE_CHECKING:
     from torch_qpmpc.experiment.choosing import Choice
+
+#: A cost that the states explain poorly may be one of outputs and inputs smoothed by such a pole.
+POLES = [1 - 0.5**k for k in range(1, 8)]
 
 
 class Start(NamedTuple):
@@ -119,7 +122,8 @@ def identified_start(
     """Identify the model and a missing stage cost from a log of the plant; see `identify`.
 
     The state is the estimate by the filter of a model of this ``order``, None for the one that
-    `fit_state_space` chooses. That of a `LinearSystem` is measured.
+    `fit_state_space` chooses. Where that explains the rewards poorly and leaves twice as much as
+    with smoothed outputs and inputs, it has these, too. That of a `LinearSystem` is measured.
     """
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     observed = not isinstance(physics, LinearSystem)
@@ -129,16 +133,27 @@ def identified_start(
     else:
         data, order = as_log(log), 0
     check_excitation(data)
+
+    def start(pole: float | None = None) -> Start:
+        own = fit._replace(model=fit.model.remembering(pole), pole=pole)
+        found = Identified(own.model, data, cfg.task.horizon, own)
+        steps = estimated(log, own.model) if observed else log
+        return Start(steps, own.model, found.horizon, fit.order, observed, cut=cut, found=found)
+
+    def left(start: Start) -> float:
+        return missed(start.log, start.layout)
+
     fit = fit_state_space(data.trajectories, order)
-    model, order = fit.model, fit.order
-    if observed:
-        physics, log = physics.observed(model), estimated(log, model)
-    found = Identified(model, data, cfg.task.horizon, fit)
-    start = Start(log, model, cfg.task.horizon, order, observed, cut=cut, found=found)
-    if find_task(cfg.task).wrong_scheme(cfg, physics).cost.stage_weight is not None:
-        return start
+    chosen = start()
+    scheme = find_task(cfg.task).wrong_scheme(cfg, chosen.plant(physics))
+    if scheme.cost.stage_weight is not None:
+        return chosen
+    if fit.order and left(chosen) > 1 - GOOD:
+        best = min(map(start, POLES), key=left)
+        chosen = best if left(best) < LEFT * left(chosen) else chosen
     diagonal = cfg.task.hessian == "diagonal"
-    return start._replace(cost=fit_rewards(log, start.layout, diagonal, model))
+    cost = fit_rewards(chosen.log, chosen.layout, diagonal, chosen.model)
+    return chosen._replace(cost=cost)
 
 
 def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
