@@ -41,7 +41,6 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Sizes,
     condense,
     convex,
-    in_order,
     reduce,
     sensitivities,
     sizes,
@@ -170,6 +169,10 @@ class Prepared:
         vectors = (x if len(x) == 1 else x[index] for x in self.theta[3:])
         theta = Theta(*matrices, *vectors)
         return group, Prepared(theta, group, self.n_kept, self.device)
+
+    def eliminated(self, elimination: Elimination, n_f: int) -> Prepared:
+        """Return the same theta with another elimination of C z = b, which keeps n_f entries."""
+        return Prepared(self.theta, self.group, n_f, self.device, elimination)
 
     def on_cpu(self) -> Prepared:
         """Return the same theta as NumPy arrays."""
@@ -301,14 +304,9 @@ class Programs:
         length = per_qp(units.length, self.group)[:, : self.n_f]
         return Programs(prepared, self.group, self.fixed / length)
 
-    def in_order(self) -> Programs | None:
-        """Return the same QPs with C z = b eliminated by `in_order`; None if that fails."""
-        elimination = in_order(self.theta.C, self.n_f)
-        if elimination is None:
-            return None
-        old = self.prepared
-        prepared = Prepared(old.theta, old.group, self.n_f, old.device, elimination)
-        return Programs(prepared, self.group, self.fixed)
+    def eliminated(self, elimination: Elimination) -> Programs:
+        """Return the same QPs with another elimination of C z = b."""
+        return Programs(self.prepared.eliminated(elimination, self.n_f), self.group, self.fixed)
 
     def solvable(self) -> np.ndarray | None:
         """Return the indices of QPs with valid data and a convex cost; None for all.

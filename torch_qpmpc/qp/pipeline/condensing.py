@@ -7,6 +7,7 @@ Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the lin
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -360,3 +361,10 @@ def null_space(C: np.ndarray, n_kept: int) -> Elimination:
     Y_neg[:, n_kept:] = -pseudo_inverse
     padding = np.concatenate((np.zeros((M, n_kept)), padded), axis=1)
     return Elimination(T, Y_neg, padding)
+
+
+#: Alternatives for QPs that no solver solves accurately after `eliminate`.
+OTHER_ELIMINATIONS: tuple[Callable[[np.ndarray, int], Elimination | None], ...] = (
+    null_space,
+    in_order,
+)

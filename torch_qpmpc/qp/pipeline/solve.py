@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextvars
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,6 +30,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     to_tensor,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
+from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
@@ -36,9 +38,10 @@ from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, 
 from torch_qpmpc.qp.tracing import serially_if_forked
 
 ON_FAILURE = ("raise", "warn", "mask")
+Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
-#: Number of iterative refinements after an elimination in the order of the equations.
+#: Number of iterative refinements after an alternative elimination.
 PASSES = 2
 
 
@@ -221,15 +224,19 @@ class AtRest:
 
 
 class Strategy(NamedTuple):
-    """One way to solve QPs: from their last active sets, or by a backend, some `in_order`."""
+    """One way to solve QPs: from their last active sets, or by a backend."""
 
     solve: Backend
     start: Array | None = None
-    in_order: bool = False
+    eliminate: Eliminate | None = None
 
     def prepared(self, programs: Programs) -> Programs | None:
         """Return the QPs with this elimination; None if it does not apply."""
-        return programs.in_order() if self.in_order else programs
+        if self.eliminate is None:
+            return programs
+        C = programs.theta.C
+        elimination = self.eliminate(C, programs.n_f) if C.size else None
+        return None if elimination is None else programs.eliminated(elimination)
 
     def certified(self, programs: Programs) -> BatchSolution:
         """Return candidates, completed and certified; active sets that do not settle are none."""
@@ -237,18 +244,18 @@ class Strategy(NamedTuple):
             return programs.recalled(self.start)
         qps = programs.reduced_qps()
         solve = self.solve if qps.l.shape[-1] else _unconstrained
-        return programs.recover(solve(qps).like(programs.fixed), PASSES if self.in_order else 0)
+        return programs.recover(solve(qps).like(programs.fixed), PASSES if self.eliminate else 0)
 
 
 def strategies(solver: str, start: Array | None) -> list[Strategy]:
     """Return the ways to solve QPs, each for those that the ones before do not solve.
 
-    Another elimination follows the solver, for ill-conditioned QPs, and then other solvers.
+    Other eliminations follow the solver, for ill-conditioned QPs, and then other solvers.
     """
     own = backend(solver)
     last_sets = [] if start is None else [Strategy(own, start)]
-    ordered = Strategy(BACKENDS["torch"], in_order=True)
-    return [*last_sets, Strategy(own), ordered, *map(Strategy, fallbacks(solver))]
+    eliminations = [Strategy(BACKENDS["torch"], eliminate=way) for way in OTHER_ELIMINATIONS]
+    return [*last_sets, Strategy(own), *eliminations, *map(Strategy, fallbacks(solver))]
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
