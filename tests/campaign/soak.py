@@ -1,4 +1,4 @@
-"""Exported controllers beside Python's in bad hours: ``python -m tests.campaign.soak``.
+"""Exported controllers beside Python's, with faulty signals: ``python -m tests.campaign.soak``.
 
 Each closes a loop of its own with the model, a load and noise. Dropouts and absurd values come in
 any signal, and operators take over in ten phases. Inputs must agree to `NEAR`, and codes exactly.
