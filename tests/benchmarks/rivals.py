@@ -1,0 +1,471 @@
+"""`improve` and Q-learning beside classical designs: ``python -m tests.benchmarks.rivals``.
+
+Two plants with a bounded input, a hidden state, an asymmetric cost, and noise that grows with state
+and action in a way that no design knows. Each design knows the log, the cost and the input's
+bounds, and nothing else of the plant:
+
+- ``mean``: MPC with the identified model and filter.
+- ``moved``: the same, aimed beyond the set-point by as much as pays for the closed loop's noise.
+- ``Riccati``: the regulator for the mean and the noise that were identified, with noise that grows
+  (de Koning, Automatica 1982), clipped to the bounds.
+- ``scenario``: MPC against 32 courses of prediction errors, drawn from the log.
+- ``two numbers``: ``mean`` with the set-point and the input's weight of least cost in simulated
+  loops of the identified, noisy models.
+- ``improve``: theta by gradients through the same loops, from ``mean``.
+- ``Q-learning``: half of the transitions are its log, and it collects the others.
+
+``scenario``, which takes long, has five seeds. J is the mean cost of a step in 2,000
+loops (scenario: 200) of 50 steps of the plant, drawn for each seed. Finished rows are kept in
+docs/results/rivals.csv; table and figure go into docs/results/improvement.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy
+import torch
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+import torch_qpmpc as qm
+import train
+from tests.benchmarks.table import DOCS
+from tests.runs import make_config
+from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.envs.linear_system import float64, normal, uniform
+from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
+from torch_qpmpc.experiment.tasks import Task, plant_layout, register
+from torch_qpmpc.learning.closed_loop import growth, simulated_plant
+from torch_qpmpc.mpc.identification import Identified
+from torch_qpmpc.study.markdown import replaced, table
+
+PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "rivals.csv"
+SIZES, SEEDS, EVALUATION = (500, 2000), range(1001, 1021), 50_000
+#: Steps of a log's episodes, of the horizon, and of the loops of J; their number.
+EPISODE, HORIZON, STEPS, LOOPS = 50, 10, 50, 2000
+
+
+class Price(NamedTuple):
+    """L = weight (y - r)^2 + slope (y - r) + above (y - r)+^2 + price (r - y)+ + effort u^2."""
+
+    r: float
+    weight: float
+    slope: float
+    above: float
+    price: float
+    effort: float
+
+    def __call__(self, y: Tensor, u: Tensor) -> Tensor:
+        e = y[..., 0] - self.r
+        own = self.weight * e.square() + self.slope * e + self.above * e.relu().square()
+        return own + self.price * (-e).relu() + self.effort * u.square().sum(-1)
+
+
+WASTE = Price(r=0.5, weight=0.05, slope=1.0, above=0.0, price=20.0, effort=0.05)
+ONE_SIDED = Price(r=0.0, weight=1.0, slope=0.0, above=10.0, price=0.0, effort=0.1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Priced(Plant):
+    """x+ = A x + B u + noise; y is x_1 with the noise of its sensor, and x_1 costs `price`."""
+
+    n_y: int = 1
+    horizon: int = HORIZON
+    price: Price
+    A: Tensor
+    B: Tensor
+
+    def signals(self, rng, count, length):
+        return normal(rng, count, length, 3)
+
+    def cost(self, x, u, w):
+        return self.price(x, u)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Dosing(Priced):
+    """A reagent is dosed, x = [y, reagent]: too little of y is dear, too much is wasted."""
+
+    lb_a: Tensor = field(default_factory=float64(0))
+    ub_a: Tensor = field(default_factory=float64(2))
+    price: Price = WASTE
+    A: Tensor = field(default_factory=float64([0.9, 0.12], [0, 0.8]))
+    B: Tensor = field(default_factory=float64([0], [0.2]))
+
+    def starts(self, rng, count):
+        return uniform(rng, count, 2) * 0.6
+
+    def output(self, x, w):
+        return x[..., :1] + 0.01 * w[..., 2:]
+
+    def step(self, x, u, w):
+        size = torch.cat((0.01 + 0.06 * x[..., :1].abs() ** 1.5, 0.02 + 0.2 * u.abs().sqrt()), -1)
+        return x @ self.A.mT + u @ self.B.mT + size * w[..., :2]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Balance(Priced):
+    """A pole with a weak motor, x = [y, velocity]: one side costs eleven times as much."""
+
+    lb_a: Tensor = field(default_factory=float64(-1))
+    ub_a: Tensor = field(default_factory=float64(1))
+    price: Price = ONE_SIDED
+    A: Tensor = field(default_factory=float64([1, 0.1], [0.02, 0.98]))
+    B: Tensor = field(default_factory=float64([0], [0.1]))
+
+    def starts(self, rng, count):
+        return (uniform(rng, count, 2) - 0.5) * 0.4
+
+    def output(self, x, w):
+        return x[..., :1] + 0.005 * w[..., 2:]
+
+    def step(self, x, u, w):
+        size = 0.01 + 0.1 * x[..., 1:].abs() + 0.08 * (u.abs() > 0.5) * u.abs()
+        noise = torch.cat((torch.zeros_like(size), size * w[..., 1:2]), -1)
+        return x @ self.A.mT + u @ self.B.mT + noise
+
+
+PLANTS: dict[str, Priced] = {"Dosing": Dosing(), "Balance": Balance()}
+
+
+def collect(plant: Priced, transitions: int, seed: int) -> Any:
+    """Return a log of random actions, in episodes of 50 steps."""
+    env = plant.vectorised(transitions // EPISODE, EPISODE, seed=seed)
+    explore = Exploration(plant.lb_a, plant.ub_a, 4, False, seed)
+    log = env.rollout(EPISODE, TensorDictModule(explore, ["observation"], ["action"]))
+    return log.contiguous()
+
+
+def scheme(plant: Any, model: qm.Model, gamma: float, moved: float, effort: float) -> qm.Scheme:
+    """Return MPC with the set-point moved by so much, and the input's weight times a factor."""
+    layout, p = plant_layout(plant, HORIZON), plant.price
+    r, weight = p.r + moved, torch.zeros(layout.n).double()
+    weight[0], weight[-1] = 2 * p.weight + p.above, 2 * effort * p.effort
+    q, lower = torch.zeros_like(weight), torch.full((layout.n_x,), -math.inf).double()
+    q[0] = p.slope - weight[0] * r
+    soft: dict[str, Any] = {}
+    if p.price:
+        lower[0] = r
+        soft = {"state_bounds": (lower, torch.full_like(lower, math.inf)), "state_slack": p.price}
+    bounds = qm.Bounds(action_bounds=(plant.lb_a, plant.ub_a), discount_slack=True, **soft)
+    q = q.repeat(HORIZON + 1)[: layout.n_z]
+    cost = qm.Cost(torch.diag(weight), torch.diag(weight[:-1]), hessian="block", q=q)
+    return qm.Scheme(layout, model, cost, bounds, gamma)
+
+
+def designed(plant: Priced, found: Identified, moved: float = 0.0, effort: float = 1.0) -> qm.QPMPC:
+    """Return MPC of the estimate by an identified model, without discount."""
+    m = found.model
+    model = qm.Model(*(torch.tensor(x) for x in (m.A, m.B, m.E, m.offset)))
+    made = scheme(plant.observed(m), model, 1.0, moved, effort)
+    learn = ("H", "H_f", "q", "b", *(("lb",) if plant.price.price else ()))
+    return qm.QPMPC(made, learn=learn, structure="tied", solver="daqp")
+
+
+def simulated_cost(plant: Any, policy: Callable[[Tensor], Tensor], seed: int) -> float:
+    """Return the mean cost of a step in 64 simulated loops."""
+    rng, total = torch.Generator().manual_seed(seed), 0.0
+    with torch.no_grad():
+        s = plant.starts(rng, 64)
+        for _ in range(STEPS):
+            a = policy(plant.known(s))
+            total += plant.cost(s, a).mean().item() / STEPS
+            s = plant.step(s, a, plant.draw(rng, 64))
+    return total
+
+
+class Regulator(NamedTuple):
+    """u = u_s - K (x - x_s), and the standard deviation of the output in its loops."""
+
+    K: np.ndarray
+    x_s: np.ndarray
+    u_s: float
+    std: float
+
+    def policy(self, plant: Priced) -> Callable[[Tensor], Tensor]:
+        """Return the regulator, clipped to the bounds of the plant's input."""
+        K, x_s = torch.tensor(self.K), torch.tensor(self.x_s)
+        return lambda x: (self.u_s - (x - x_s) @ K.mT).clamp(plant.lb_a, plant.ub_a)
+
+
+def regulator(plant: Priced, found: Identified) -> Regulator:
+    """Return the regulator for innovations whose covariance grows with state and action.
+
+    About the output m, the cost of an output with its standard deviation is quadratic: m minimises
+    its mean, and the weight is the second derivative of the mean.
+    """
+    A, B, _, offset, C, L, S, *_ = found.model
+    n, node, mass = len(A), *np.polynomial.hermite_e.hermegauss(80)
+    c = _growth(found)
+    left = np.block([[A - np.eye(n), B], [C, np.zeros((1, 1))]])
+
+    def steady(m: float) -> np.ndarray:
+        return np.linalg.lstsq(left, np.append(-offset, m), rcond=None)[0]
+
+    def mean(m: float, u: float, std: float) -> float:
+        costs = plant.price(torch.tensor(m + std * node)[:, None], torch.full((80, 1), u))
+        return float(costs.numpy() @ mass / mass.sum())
+
+    std, r = float(S[0, 0]) ** 0.5, plant.price.r
+    for _ in range(30):
+        around = (r - 6 * std, r + 6 * std)
+        m = scipy.optimize.minimize_scalar(
+            lambda m, std=std: mean(m, float(steady(m)[-1]), std), bounds=around, method="bounded"
+        ).x
+        v_s, h = steady(m), std / 2
+        w = mean(m + h, 0.0, std) - 2 * mean(m, 0.0, std) + mean(m - h, 0.0, std)
+        Q, R = w / h**2 * C.T @ C, 2 * plant.price.effort
+        P = Q
+        for _ in range(2000):
+            M = S[0, 0] * (L.T @ P @ L)[0, 0] * c[1:]
+            G = R + (B.T @ P @ B)[0, 0] + M[-1]
+            K, last = B.T @ P @ A / G, P
+            P = Q + A.T @ P @ A + np.diag(M[:-1]) - G * K.T @ K
+            if abs(P - last).max() <= 1e-10 * abs(P).max():
+                break
+        X, closed = np.zeros((n, n)), A - B @ K
+        for _ in range(2000):
+            size = c[0] + c[1:] @ (v_s**2 + np.append(np.diag(X), K @ X @ K.T))
+            X, last = closed @ X @ closed.T + S[0, 0] * size * L @ L.T, X
+            if abs(X - last).max() <= 1e-10 * abs(X).max():
+                break
+        std = (C @ X @ C.T).item() ** 0.5
+    return Regulator(K, v_s[:-1], float(v_s[-1]), std)
+
+
+def _growth(found: Identified) -> np.ndarray:
+    """Return how the innovations' variance grows with the squares of state and action."""
+    model, parts = (
+        found.model,
+        [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories],
+    )
+    e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
+    x = np.concatenate([model.estimates(*part)[:-1] for part in parts])
+    return growth(e, np.hstack((x, np.concatenate([u for _, u, _ in parts]))))[0]
+
+
+class Scenarios:
+    """MPC whose actions cost least in the mean over 32 courses of the log's prediction errors."""
+
+    def __init__(self, plant: Priced, found: Identified, seed: int) -> None:
+        A, B, _, offset, C, *_ = found.model
+        powers = [np.eye(len(A))]
+        for _ in range(HORIZON):
+            powers.append(A @ powers[-1])
+        self.free = torch.tensor(np.vstack([C @ F for F in powers[1:]]))
+        of = [
+            [(C @ powers[i - j] @ B)[0, 0] if j <= i else 0.0 for j in range(HORIZON)]
+            for i in range(HORIZON)
+        ]
+        self.of = torch.tensor(of)
+        self.constant = torch.tensor(np.cumsum([(C @ F @ offset)[0] for F in powers[:-1]]))
+        parts = [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories]
+        errors = np.concatenate([found.model.errors(*part, HORIZON)[..., 0] for part in parts])
+        self.errors = torch.tensor(errors[np.isfinite(errors).all(1)])
+        self.plant, self.rng, self.u = plant, torch.Generator().manual_seed(seed), None
+
+    def loss(self, u: Tensor, y: Tensor, e: Tensor) -> Tensor:
+        """Return the mean cost of actions ``(count, N)``."""
+        y = y + u @ self.of.mT
+        costs = self.plant.price((y[:, None] + e)[..., None], u[:, None, :, None])
+        return costs.sum(-1).mean(1)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        low, high = self.plant.lb_a, self.plant.ub_a
+        drawn = torch.randint(len(self.errors), (len(x), 32), generator=self.rng)
+        y, e = x @ self.free.mT + self.constant, self.errors[drawn]
+        if self.u is None or len(self.u) != len(x):
+            self.u = ((low + high) / 2).expand(len(x), HORIZON)
+        with torch.enable_grad():
+            u = torch.cat((self.u[:, 1:], self.u[:, -1:]), 1).clone().requires_grad_()
+            adam = torch.optim.Adam([u], lr=float(high - low) / 20)
+            schedule = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 0.01, 100)
+            for _ in range(100):
+                adam.zero_grad()
+                self.loss(u, y, e).sum().backward()
+                adam.step()
+                schedule.step()
+                u.data.clamp_(low, high)
+        self.u = u.detach()
+        return self.u[:, :1]
+
+
+def tuned(plant: Priced, found: Identified, simulated: Any, std: float, seed: int) -> qm.QPMPC:
+    """Return MPC with the set-point and the input's weight of least cost in simulated loops."""
+
+    def cost(z: Iterable[float]) -> float:
+        moved, effort = z
+        return simulated_cost(
+            simulated, designed(plant, found, std * moved, 10**effort).policy, seed
+        )
+
+    z = min(product((-2, -1, 0, 1, 2), (0, 1, 2)), key=cost)
+    best = scipy.optimize.minimize(cost, z, method="Nelder-Mead", options={"maxfev": 15}).x
+    return designed(plant, found, std * best[0], 10 ** best[1])
+
+
+OPTIONS = {"solver": "daqp", "num_envs": 10, "steps_per_update": 4, "warmup_steps": 4}
+OPTIONS |= {"gate": False, "figures": False, "rivals": False, "logger": "csv"}
+OPTIONS |= {"defaults": [{"override /constraint": "identified"}, {"override /start": "data"}]}
+TASK = {"horizon": HORIZON, "gamma": 0.95, "episode_steps": EPISODE, "eval_steps": STEPS}
+TASK |= {"hessian": "block", "discount_slack": True, "learn_cost": ["H", "H_f", "q", "c"]}
+
+
+def make_dosing(cfg: Any) -> Priced:
+    return PLANTS["Dosing"]
+
+
+def make_balance(cfg: Any) -> Priced:
+    return PLANTS["Balance"]
+
+
+def own_scheme(cfg: Any, plant: Priced) -> qm.Scheme:
+    return scheme(plant, qm.Model(), cfg.task.gamma, 0.0, 1.0)
+
+
+for _make in (make_dosing, make_balance):
+    _name = _make.__name__.removeprefix("make_")
+    register(
+        Task(_name, _make, own_scheme, closed_loop=plant_loop, defaults={**OPTIONS, "task": TASK})
+    )
+
+
+def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Identified]:
+    """Return what train.py learns from half the transitions as its log and the others, one by one.
+
+    Its log's model is that of the filter.
+    """
+    half = transitions // 2
+    options = {"seed": seed, "start.transitions": half, "updates": half // 40 - 1}
+    options |= {"eval_interval": half // 40 - 1, "replay_capacity": 2 * half}
+    cfg = make_config(f"task={name.lower()}", *(f"{key}={x}" for key, x in options.items()))
+    with tempfile.TemporaryDirectory() as folder:
+        train.train(cfg, folder, quiet=True)
+        log = stored_log(Path(folder) / LOG)
+        return qm.load_run(folder).policy, qm.identify(log, HORIZON)
+
+
+def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Yield the fields of each design's row."""
+    plant, began = PLANTS[name], time.process_time()
+    found = qm.identify(collect(plant, size, seed), HORIZON)
+
+    def price(p: Tensor, u: Tensor) -> Tensor:
+        return plant.price(p, u)
+
+    def row(design: str, policy: Callable, model: Any = found.model, loops: int = LOOPS) -> Any:
+        nonlocal began
+        seconds = time.process_time() - began
+        seen = plant.observed(model)
+        loop = plant_loop(policy, seen, steps=STEPS, starts=loops, seed=EVALUATION + seed)
+        names = {"plant": name, "transitions": size, "seed": seed, "design": design}
+        began = time.process_time()
+        return names | {"J": loop.costs.mean().item(), "seconds": round(seconds, 1)}
+
+    mpc = designed(plant, found)
+    yield row("mean", mpc.policy)
+    known = regulator(plant, found)
+    yield row("Riccati", known.policy(plant))
+    moved = float((found.model.C @ known.x_s)[0]) - plant.price.r
+    yield row("moved", designed(plant, found, moved).policy)
+    models = simulated_plant(found, price, HORIZON, seed=seed)
+    yield row("two numbers", tuned(plant, found, models, known.std, seed).policy)
+    if size == 2000 and seed in SEEDS[:5]:
+        yield row("scenario", Scenarios(plant, found, seed), loops=200)
+    qm.improve(mpc, found, cost=price, updates=60, steps=STEPS, seed=seed)
+    yield row("improve", mpc.policy)
+    mpc, found = q_learning(name, size, seed)
+    yield row("Q-learning", mpc.policy, found.model)
+
+
+def shown(rows: Any) -> str:
+    """Format the median and the worst J of each design, and how `improve` compares with it."""
+    parts, marks = [], compared(rows)
+    for plant, own in rows.groupby("plant", sort=False):
+        sizes = sorted(own["transitions"].unique())
+        J = own.groupby(["design", "transitions"])["J"]
+        cells = {
+            key: f"{some.median():.3g}/{some.max():.3g}{marks.get((plant, *key), '')}"
+            for key, some in J
+        }
+        lines = [[x, *(cells.get((x, size), "") for size in sizes)] for x in own["design"].unique()]
+        parts.append(table([plant, *(f"{size:,}" for size in sizes)], lines))
+    return "\n\n".join(parts)
+
+
+def compared(rows: Any) -> dict[Any, str]:
+    """Return on how many seeds `improve` costs less, with * where p < 0.05 by Holm's procedure."""
+    J = rows.pivot_table("J", ["plant", "transitions", "seed"], "design")
+    better, p = {}, {}
+    for (plant, size), own in J.groupby(["plant", "transitions"]):
+        for design in own.columns.drop("improve"):
+            if own[design].notna().all():
+                key = plant, design, size
+                better[key] = int((own["improve"] < own[design]).sum())
+                p[key] = float(scipy.stats.wilcoxon(own["improve"], own[design]).pvalue)
+    marks, rejects = {}, True
+    for i, key in enumerate(sorted(p, key=lambda key: p[key])):
+        rejects = rejects and p[key] * (len(p) - i) < 0.05
+        marks[key] = f"/{better[key]}" + "*" * rejects
+    return marks
+
+
+def drawn(rows: Any) -> Figure:
+    """Draw J over the number of transitions: medians, and ranges over the seeds."""
+    figure = Figure(figsize=(8, 3.2), layout="constrained")
+    groups = rows.groupby("plant", sort=False)
+    for axes, (plant, own) in zip(
+        figure.subplots(1, len(groups), squeeze=False)[0], groups, strict=True
+    ):
+        for i, (design, some) in enumerate(own.groupby("design", sort=False)):
+            J = some.groupby("transitions")["J"]
+            x = np.array(sorted(J.groups)) * 1.06**i
+            spread = [J.median() - J.min(), J.max() - J.median()]
+            axes.errorbar(x, J.median(), yerr=spread, marker="o", ms=3, capsize=2, label=design)
+        axes.set(title=plant, xlabel="transitions", ylabel="J, cost of a step", xscale="log")
+        axes.set_xticks(ticks := sorted(own["transitions"].unique()), [f"{x:,}" for x in ticks])
+        axes.xaxis.set_minor_locator(NullLocator())
+        J = own.groupby(["design", "transitions"])["J"].median()
+        axes.set_ylim(0.8 * own["J"].min(), 1.2 * J.max())  # some worst seeds are far above
+        axes.legend(fontsize="x-small")
+    return figure
+
+
+def main(arguments: Iterable[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.rivals")
+    parser.add_argument("--plants", nargs="+", choices=PLANTS, default=[*PLANTS])
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
+    options = parser.parse_args(None if arguments is None else list(arguments))
+    torch.set_num_threads(1)
+    rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
+    keys = ["plant", "transitions", "seed"]
+    done = {*rows[keys].itertuples(index=False, name=None)} if len(rows) else {}
+    for key in product(options.plants, options.sizes, options.seeds):
+        if key not in done:
+            rows = pd.concat([rows, pd.DataFrame([*run(*key)])])
+            rows.to_csv(options.results, index=False, float_format="%.6g")
+            print(rows.tail(8).to_string(header=False, index=False), flush=True)
+    text = options.page.read_text(encoding="utf-8")
+    options.page.write_text(replaced(text, shown(rows), "rivals"), encoding="utf-8")
+    drawn(rows).savefig(options.page.with_name("rivals.png"), dpi=110)
+
+
+if __name__ == "__main__":
+    main()
