@@ -30,7 +30,7 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 BUDGET = {
     ".": 394,
     "analysis": 851,
-    "control": 4295,
+    "control": 4296,
     "envs": 1394,
     "experiment": 3122,
     "export": 1244,

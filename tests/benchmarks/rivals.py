@@ -247,12 +247,14 @@ def regulator(plant: Priced, found: Identified) -> Regulator:
     return Regulator(K, v_s[:-1], float(v_s[-1]), std)
 
 
+def _arrays(found: Identified) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return y, u and d of the log's trajectories."""
+    return [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories]
+
+
 def _growth(found: Identified) -> np.ndarray:
     """Return how the innovations' variance grows with the squares of state and action."""
-    model, parts = (
-        found.model,
-        [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories],
-    )
+    model, parts = found.model, _arrays(found)
     e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
     x = np.concatenate([model.estimates(*part)[:-1] for part in parts])
     return growth(e, np.hstack((x, np.concatenate([u for _, u, _ in parts]))))[0]
@@ -267,14 +269,11 @@ class Scenarios:
         for _ in range(HORIZON):
             powers.append(A @ powers[-1])
         self.free = torch.tensor(np.vstack([C @ F for F in powers[1:]]))
-        of = [
-            [(C @ powers[i - j] @ B)[0, 0] if j <= i else 0.0 for j in range(HORIZON)]
-            for i in range(HORIZON)
-        ]
-        self.of = torch.tensor(of)
+        pulse = [(C @ F @ B)[0, 0] for F in powers[:-1]]
+        self.of = torch.tensor(scipy.linalg.toeplitz(pulse, np.zeros(HORIZON)))
         self.constant = torch.tensor(np.cumsum([(C @ F @ offset)[0] for F in powers[:-1]]))
-        parts = [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories]
-        errors = np.concatenate([found.model.errors(*part, HORIZON)[..., 0] for part in parts])
+        courses = [found.model.errors(*part, HORIZON)[..., 0] for part in _arrays(found)]
+        errors = np.concatenate(courses)
         self.errors = torch.tensor(errors[np.isfinite(errors).all(1)])
         self.plant, self.rng, self.u = plant, torch.Generator().manual_seed(seed), None
 

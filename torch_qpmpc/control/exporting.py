@@ -6,7 +6,6 @@ import ctypes
 import math
 import tempfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -233,15 +232,17 @@ def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:
         SolverError: no input satisfies the hard bounds in the first step.
     """
     rows, stages = [], slice(None if law.design.references == "preview" else 1)
-    with suppress(QPError, SolverError):  # no plan, or outputs above `Law.max_plausible`
+    try:
         for (y, r, known), move, _ in closed_loop(
             law, Memory(course["u"]), None, steps, act=act, **course
         ):
             rows.append((y, r[stages], known, move.u))
-    if not rows:
-        raise SolverError(
-            "No input satisfies the hard bounds at rest: widen them, or give the outputs a y_slack."
-        )
+    except (QPError, SolverError) as error:  # no plan, or outputs above `Law.max_plausible`
+        if not rows:
+            raise SolverError(
+                "No input satisfies the hard bounds at rest: widen them, or give the outputs a "
+                "y_slack."
+            ) from error
     y, r, known, u = map(np.array, zip(*rows, strict=True))
     return Loop(y, r, known, u, course["u"][None])
 

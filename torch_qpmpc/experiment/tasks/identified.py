@@ -148,9 +148,9 @@ def identified_start(
     scheme = find_task(cfg.task).wrong_scheme(cfg, chosen.plant(physics))
     if scheme.cost.stage_weight is not None:
         return chosen
-    if fit.order and left(chosen) > 1 - GOOD:
-        best = min(map(start, POLES), key=left)
-        chosen = best if left(best) < LEFT * left(chosen) else chosen
+    if fit.order and (own := left(chosen)) > 1 - GOOD:
+        least, best = min(((left(one), one) for one in map(start, POLES)), key=lambda pair: pair[0])
+        chosen = best if least < LEFT * own else chosen
     diagonal = cfg.task.hessian == "diagonal"
     cost = fit_rewards(chosen.log, chosen.layout, diagonal, chosen.model)
     return chosen._replace(cost=cost)
