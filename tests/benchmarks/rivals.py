@@ -49,7 +49,7 @@ from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
 from torch_qpmpc.experiment.tasks import Task, plant_layout, register
-from torch_qpmpc.learning.closed_loop import growth, simulated_plant
+from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
 from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -247,17 +247,11 @@ def regulator(plant: Priced, found: Identified) -> Regulator:
     return Regulator(K, v_s[:-1], float(v_s[-1]), std)
 
 
-def _arrays(found: Identified) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return y, u and d of the log's trajectories."""
-    return [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in found.log.trajectories]
-
-
 def _growth(found: Identified) -> np.ndarray:
     """Return how the innovations' variance grows with the squares of state and action."""
-    model, parts = found.model, _arrays(found)
-    e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
-    x = np.concatenate([model.estimates(*part)[:-1] for part in parts])
-    return growth(e, np.hstack((x, np.concatenate([u for _, u, _ in parts]))))[0]
+    log = found.log.trajectories
+    x, e = filtered(found.model, log)
+    return growth(e, np.hstack((x, np.concatenate([one.u for one in log]))))[0]
 
 
 class Scenarios:
@@ -272,8 +266,8 @@ class Scenarios:
         pulse = [(C @ F @ B)[0, 0] for F in powers[:-1]]
         self.of = torch.tensor(scipy.linalg.toeplitz(pulse, np.zeros(HORIZON)))
         self.constant = torch.tensor(np.cumsum([(C @ F @ offset)[0] for F in powers[:-1]]))
-        courses = [found.model.errors(*part, HORIZON)[..., 0] for part in _arrays(found)]
-        errors = np.concatenate(courses)
+        parts = ([x.numpy() for x in one] for one in found.log.trajectories)
+        errors = np.concatenate([found.model.errors(*part, HORIZON)[..., 0] for part in parts])
         self.errors = torch.tensor(errors[np.isfinite(errors).all(1)])
         self.plant, self.rng, self.u = plant, torch.Generator().manual_seed(seed), None
 

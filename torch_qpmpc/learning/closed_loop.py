@@ -66,16 +66,16 @@ class SimulatedPlant:
         horizon: int = 0,
     ) -> None:
         self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
-        noises = zip(*(_noise(model, log) for model in models), strict=True)
+        u, seen = torch.cat([one.u for one in log]), [filtered(x, log) for x in (*models, observer)]
+        noises = zip(*(_noise(x, u.numpy(), e) for x, e in seen[:-1]), strict=True)
         self._residuals, self._growth = map(torch.stack, noises)
         self._horizon, n_y = horizon, self._residuals.shape[-1]
         self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
         steps = torch.tensor([one.steps for one in log])
         self._first = (steps.cumsum(0) - steps).repeat_interleave(steps)
         self._last = (steps.cumsum(0) - 1).repeat_interleave(steps)
-        self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
-        self._seen = _stacked([_estimates(model, log) for model in (*models, observer)])
-        self._y = torch.cat([x.y[:-1] for x in log])
+        self._d, self._y = torch.cat([one.d for one in log]), torch.cat([one.y[:-1] for one in log])
+        self._seen = _stacked([x for x, _ in seen])
         self._rows = torch.arange(len(self._d))  # where loops start, if from the log
         self._from_log = self._d.shape[1] > 0
 
@@ -202,17 +202,25 @@ def ensemble(identified: Identified, members: int, seed: int) -> list[Innovation
     return models
 
 
-def _estimates(model: Innovations, log: Sequence[Trajectory]) -> np.ndarray:
-    """Return the model's estimates in the steps of a log, ``(steps, n)``."""
-    parts = ((x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in log)
-    return np.concatenate([model.estimates(*part)[:-1] for part in parts])
+def filtered(model: Innovations, log: Sequence[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the estimates in a log's steps ``(steps, n)`` and the innovations after them.
+
+    Trajectories of equal length are filtered together.
+    """
+    x, e = [np.empty(0)] * len(log), [np.empty(0)] * len(log)
+    for steps in {one.steps for one in log}:
+        same = [i for i, one in enumerate(log) if one.steps == steps]
+        y, u, d = (np.stack([log[i][part].numpy() for i in same]) for part in range(3))
+        now = model.estimates(y, u, d)[:, :-1]
+        after = y[:, 1:] - (now @ model.A.T + model.inputs(u, d)) @ model.C.T
+        for i, *parts in zip(same, now, after, strict=True):
+            x[i], e[i] = parts
+    return np.concatenate(x), np.concatenate(e)
 
 
-def _noise(model: Innovations, log: Sequence[Trajectory]) -> tuple[Tensor, Tensor]:
-    """Return the log's innovations in unit covariance, and the `growth` of their variances."""
-    parts = [(x.y.numpy(), x.u.numpy(), x.d.numpy()) for x in log]
-    e = np.concatenate([model.errors(*part, 1)[:, 0] for part in parts])
-    v = np.hstack((_estimates(model, log), np.concatenate([u for _, u, _ in parts])))
+def _noise(x: np.ndarray, u: np.ndarray, e: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Return innovations in unit covariance, and the `growth` of their variances."""
+    v = np.hstack((x, u))
     seen = np.isfinite(e).all(1)
     e, v = e[seen] - e[seen].mean(0), v[seen]
     c = growth(e, v)
@@ -434,8 +442,7 @@ def improve(
     for name, size in sizes.items():
         check_whole(name, size, 1)
     check_whole("held_out", held_out, FEWEST)
-    window = steps if window is None else window
-    check_whole("window", window, 1)
+    check_whole("window", steps if window is None else window, 1)
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
     if isinstance(plant, Identified):
