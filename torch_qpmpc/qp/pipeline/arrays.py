@@ -132,6 +132,17 @@ class BatchSolution(NamedTuple):
         for own, new in zip(self, others, strict=True):
             own[index] = new
 
+    def error(self) -> Array:
+        """Return the larger one of the residual and the value's error, ``(B,)``."""
+        larger = np.maximum if isinstance(self.residual, np.ndarray) else torch.maximum
+        return larger(self.residual, self.value_error)
+
+    def improve(self, index: Array, others: BatchSolution) -> None:
+        """Replace the solutions at ``index`` where the others' errors are no larger."""
+        now, new = self.error()[index], others.error()
+        better = indices((new <= now) | (now != now))
+        self.put(index[better], others.at(better))
+
     def clear(self, index: np.ndarray, placeholders: BatchSolution) -> None:
         """Replace all but the errors of the solutions at ``index``."""
         errors = {"residual": self.residual, "value_error": self.value_error}

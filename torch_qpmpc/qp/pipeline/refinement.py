@@ -16,6 +16,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
+from torch_qpmpc.qp.kernels.linalg import compiled
 from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -39,6 +40,8 @@ FLAT = 1e-14
 RUNAWAY = 1e6
 #: A row this close to its bound, relatively, may be active at a vertex.
 NEAR = 1e-6
+#: Splits a number into two halves of 26 bits.
+SPLIT = 134217729.0
 TINY = np.finfo(float).tiny
 
 
@@ -356,19 +359,39 @@ def _equilibrated(K: np.ndarray) -> np.ndarray:
 
 def _product(matrix: np.ndarray, x: Twice) -> Twice:
     """Return matrix x in twice the working precision."""
-    products, errors = _two_product(matrix, x.high)
-    low = (errors + matrix * x.low).sum(-1)
-    while (n := products.shape[-1]) > 1:
-        half, odd = n // 2, products[:, n // 2 * 2 :]
-        products, errors = _two_sum(products[:, :half], products[:, half : 2 * half])
-        products, low = np.hstack((products, odd)), low + errors.sum(-1)
-    high = products[:, 0] if products.shape[-1] else np.zeros(len(matrix))
-    return Twice(*_two_sum(high, low))
+    return Twice(*_two_sum(*products(matrix, x.high, x.low)))
+
+
+@compiled
+def products(matrix, high, low):
+    """Return compensated sums of matrix (high + low), and their errors (Ogita et al., 2005)."""
+    m, n = matrix.shape
+    sums, errors, upper, kept = np.zeros(m), np.zeros(m), np.empty(n), np.empty(n, np.bool_)
+    for j in range(n):
+        kept[j] = not np.isfinite(high[j] + low[j])
+        spread = SPLIT * high[j]
+        upper[j] = spread - (spread - high[j])
+    for i in range(m):
+        for j in range(n):
+            a, x = matrix[i, j], high[j]
+            if a == 0.0 and not kept[j]:
+                continue
+            # The product and its error (Dekker), then the sum and its error (Knuth).
+            product, spread, x_upper = a * x, SPLIT * a, upper[j]
+            a_upper = spread - (spread - a)
+            a_lower, x_lower = a - a_upper, x - x_upper
+            error = (a_upper * x_upper - product) + a_upper * x_lower + a_lower * x_upper
+            error += a_lower * x_lower + a * low[j]
+            total = sums[i] + product
+            part = total - sums[i]
+            errors[i] += (sums[i] - (total - part)) + (product - part) + error
+            sums[i] = total
+    return sums, errors
 
 
 def _dot(x: Twice, y: Twice) -> float:
-    products = _product(x.high[None], y)
-    return float(products.high[0] + (products.low[0] + x.low @ y.high))
+    product = _product(x.high[None], y)
+    return float(product.high[0] + (product.low[0] + x.low @ y.high))
 
 
 def _two_sum(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -376,17 +399,3 @@ def _two_sum(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     total = x + y
     part = total - x
     return total, (x - (total - part)) + (y - part)
-
-
-def _two_product(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x y rounded, and its error (Dekker)."""
-    product, (x_high, x_low), (y_high, y_low) = x * y, _split(x), _split(y)
-    error = ((x_high * y_high - product) + x_high * y_low + x_low * y_high) + x_low * y_low
-    return product, error
-
-
-def _split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split x into two halves of 26 bits."""
-    spread = 134217729.0 * x
-    high = spread - (spread - x)
-    return high, x - high

@@ -41,6 +41,8 @@ ON_FAILURE = ("raise", "warn", "mask")
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
+#: So many rejected QPs are refined one by one at once; of more, other eliminations come first.
+FEW = 8
 #: Number of iterative refinements after an alternative elimination.
 PASSES = 2
 
@@ -52,7 +54,7 @@ class SolveLog:
     Attributes:
         solves: QPs, solved or not.
         unsolved: QPs without a certified solution.
-        fallback: QPs whose first solution was rejected.
+        fallback: QPs that their solver and the refinement of a few do not solve.
         refined: rejected solutions that were refined in twice the working precision, which is slow.
         recalled: QPs solved by their warm start alone.
         iterations: the solvers' iterations.
@@ -284,47 +286,61 @@ def solve_programs(programs: Programs, solver: str, start: Array | None = None) 
     return solution
 
 
-def _solved(programs: Programs, solver: str, start: Array | None, log: SolveLog) -> BatchSolution:
+def _solved(
+    programs: Programs,
+    solver: str,
+    start: Array | None,
+    log: SolveLog,
+    solution: BatchSolution | None = None,
+) -> BatchSolution:
     """Try one strategy after the other on the QPs without a certified solution.
 
-    The first runs on their device. What it leaves is diagnosed: a QP that is proved to have no
-    solution is tried no further.
+    The first runs on their device. A few QPs that the solver leaves are refined and diagnosed, one
+    by one, and of many those that other eliminations, which take whole batches, leave: a QP that is
+    proved to have no solution is tried no further. A ``solution`` has candidates that were
+    rejected.
     """
     status = np.full(len(programs), int(Status.NOT_CONVERGED))
-    todo, solution = programs.solvable(), None
-    if todo is not None:
+    todo = programs.solvable() if solution is None else np.arange(len(programs))
+    if solution is None and todo is not None:
         status[:] = Status.INVALID_DATA
         solution, status[todo] = programs.unsolved(status), Status.NOT_CONVERGED
         todo = on_device(todo, programs.prepared.device)
         start = None if start is None else start[todo]
     ways = strategies(solver, start)
-    own = ways[start is not None]  # what the solver itself leaves is diagnosed
+    own = singly = ways[start is not None]
     for way in ways:
         if todo is not None and not len(todo):
             break
         rest = way.prepared(programs if todo is None else programs.take(todo))
-        if rest is None:
-            continue
-        answer = way.certified(rest)
-        if way.start is not None:
-            log.recalled += int(answer.accepted().sum())
-        if todo is None and answer.all_accepted:
-            return answer
-        if way.start is None and not answer.all_accepted:  # what follows needs the CPU
-            programs, rest, answer = programs.on_cpu(), rest.on_cpu(), answer.on_cpu()
-            solution, last = solution and solution.on_cpu(), way is ways[-1]
-            todo = None if todo is None else to_numpy(todo)
-            rejected = ~answer.accepted() & (last | (answer.residual <= NEARLY))
-            log.refined += int(rejected.sum())
-            refine(rest, answer, np.flatnonzero(rejected), last)
-        left = indices(~answer.accepted())
-        if solution is None or todo is None:
-            solution, todo = answer, left
-        else:
-            solution.put(todo, answer)
-            todo = todo[left]
-        if way is own and len(todo):
+        if rest is not None:
+            answer = way.certified(rest)
+            if way.start is not None:
+                log.recalled += int(answer.accepted().sum())
+            if todo is None and answer.all_accepted:
+                return answer
+            if way.start is None and not answer.all_accepted:  # what follows needs the CPU
+                programs, answer = programs.on_cpu(), answer.on_cpu()
+                solution = solution and solution.on_cpu()
+                todo = None if todo is None else to_numpy(todo)
+            if solution is None or todo is None:
+                solution, todo = answer, indices(~answer.accepted())
+            else:
+                solution.improve(todo, answer)
+                todo = todo[~solution.accepted()[todo]]
+        assert solution is not None
+        assert todo is not None
+        if way is own and len(todo) > FEW:
             log.fallback += len(todo)
+            singly = [way for way in ways if way.eliminate is not None][-1]
+        last = way is ways[-1]
+        if (way is singly or last) and len(todo):
+            near = todo if last else todo[solution.residual[todo] <= NEARLY]
+            log.refined += len(near)
+            refine(programs, solution, near, last)
+            todo = todo[~solution.accepted()[todo]]
+        if way is singly and len(todo):
+            log.fallback += len(todo) if way is own else 0
             status[todo] = diagnose(programs.take(todo))
             todo = todo[status[todo] == Status.NOT_CONVERGED]
     assert solution is not None
@@ -360,13 +376,21 @@ def _confirmed(
     if lengths is not None:
         units = units._replace(length=units.length / lengths.length)
     rejected = _refuted(programs, solution, accepted)
+
+    def refuted_in_units(which: np.ndarray) -> np.ndarray:
+        in_units = units.inverse().restored(solution, programs.group)
+        return _refuted(scaled, in_units, which[solution.accepted()[which]])
+
+    if len(rejected) > FEW:
+        part, candidates = programs.take(rejected), solution.at(rejected)
+        solution.put(rejected, _solved(part, solver, None, SolveLog(), candidates))
+        rest = rejected[~solution.accepted()[rejected]]
+        rejected = np.concatenate((rest, refuted_in_units(rejected)))
     log.refined += len(rejected)
     failed = refine(programs, solution, rejected)
     if len(failed):
         solution.put(failed, _solved(programs.take(failed), solver, None, SolveLog()))
-        in_units = units.inverse().restored(solution, programs.group)
-        failed = failed[solution.accepted()[failed]]
-        failed = _refuted(scaled, in_units, failed)
+        failed = refuted_in_units(failed)
         solution.put(failed, programs.unsolved(Status.NOT_CONVERGED).at(failed))
     return solution if lengths is None else lengths.restored(solution, programs.group)
 
