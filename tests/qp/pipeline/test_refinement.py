@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from tests.campaign.families import Case, Draw, parallel_rows
 from tests.problems import known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline import refinement
-from torch_qpmpc.qp.pipeline.refinement import refine
+from torch_qpmpc.qp.pipeline.refinement import products, refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
@@ -63,6 +64,29 @@ def test_a_flat_direction_has_its_solution_of_least_norm(solver, case):
     solution = solve_qp(qp, data["fixed"], solver=solver)
     assert_close(solution.value, data["value"], rtol=1e-9, atol=0)
     assert solution.z.abs().max() < 2
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-150, 1e150])
+def test_products_have_twice_the_working_precision(size):
+    """Sums of terms that cancel to 1e-20 of their size, some with zeros, beside fractions."""
+    rng = np.random.default_rng(0)
+    matrix, high = rng.normal(size=(5, 40)) * (rng.uniform(size=(5, 40)) < 0.8), rng.normal(size=40)
+    matrix, high, low = matrix * size, high / size, 1e-17 * rng.normal(size=40) / size
+    matrix[:, 1], high[:2], low[:2] = -matrix[:, 0], 1e20 * high[2], 0.0
+    exact = [
+        sum(
+            Fraction(a) * (Fraction(x) + Fraction(y))
+            for a, x, y in zip(row, high, low, strict=True)
+        )
+        for row in matrix
+    ]
+    sums, errors = products(matrix, high, low)
+    for i, value in enumerate(exact):
+        assert abs(Fraction(sums[i]) + Fraction(errors[i]) - value) < 1e-28 * 1e20
+
+
+def test_products_with_infinite_numbers_have_no_value():
+    assert np.isnan(products(np.zeros((1, 2)), np.array([1.0, np.inf]), np.zeros(2))[0])
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-6, 1e-3])

@@ -15,7 +15,7 @@ from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.solve import AtRest
+from torch_qpmpc.qp.pipeline.solve import FEW, AtRest
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
@@ -158,14 +158,15 @@ def test_wrong_answers_are_caught_and_replaced(liar):
     assert log.fallback >= BATCH - 1  # the one whose solution stands for all is right
 
 
+@pytest.mark.parametrize("count", [BATCH, 2 * BATCH])
 @pytest.mark.parametrize("name", INACCURACIES)
-def test_inaccurate_answers_are_sharpened(monkeypatch, name):
+def test_inaccurate_answers_are_sharpened_or_of_many_solved_again(monkeypatch, name, count):
     monkeypatch.setitem(BACKENDS, "coarse", doctored(INACCURACIES[name]))
-    known = known_qp(0, batch=(BATCH,), matrices=(BATCH,))
+    known = known_qp(0, batch=(count,), matrices=(count,))
     with SolveLog() as log:
         solution = solve(known, solver="coarse")
     assert_right(solution, known)
-    assert log.fallback == 0
+    assert (log.refined, log.fallback) == ((count, 0) if count <= FEW else (0, count))
     assert solution.residual.max() < 1e-9
 
 
