@@ -37,7 +37,7 @@ BUDGET = {
     "learning": 2776,
     "mpc": 5039,
     "proofs": 999,
-    "qp": 5679,
+    "qp": 5672,
     "study": 548,
 }
 #: Libraries that only some layers may import.

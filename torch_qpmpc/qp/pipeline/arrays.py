@@ -138,9 +138,9 @@ class BatchSolution(NamedTuple):
         return larger(self.residual, self.value_error)
 
     def improve(self, index: Array, others: BatchSolution) -> None:
-        """Replace the solutions at ``index`` where the others' errors are no larger."""
-        now, new = self.error()[index], others.error()
-        better = indices((new <= now) | (now != now))
+        """Replace solutions at ``index`` with larger errors than the others', and placeholders."""
+        nothing = ~(self.residual[index] < float("inf"))
+        better = indices(nothing | (others.error() < self.error()[index]))
         self.put(index[better], others.at(better))
 
     def clear(self, index: np.ndarray, placeholders: BatchSolution) -> None:

@@ -325,8 +325,8 @@ def _solved(
                 todo = None if todo is None else to_numpy(todo)
             if solution is None or todo is None:
                 solution, todo = answer, indices(~answer.accepted())
-            else:
-                solution.improve(todo, answer)
+            else:  # the last candidate is refined, whatever was refined before
+                (solution.put if way is ways[-1] else solution.improve)(todo, answer)
                 todo = todo[~solution.accepted()[todo]]
         assert solution is not None
         assert todo is not None
@@ -376,22 +376,15 @@ def _confirmed(
     if lengths is not None:
         units = units._replace(length=units.length / lengths.length)
     rejected = _refuted(programs, solution, accepted)
-
-    def refuted_in_units(which: np.ndarray) -> np.ndarray:
+    if len(rejected):
+        part, second = programs.take(rejected), SolveLog()
+        again = _solved(part, solver, None, second, solution.at(rejected))
+        solution.put(rejected, again)
         in_units = units.inverse().restored(solution, programs.group)
-        return _refuted(scaled, in_units, which[solution.accepted()[which]])
-
-    if len(rejected) > FEW:
-        part, candidates = programs.take(rejected), solution.at(rejected)
-        solution.put(rejected, _solved(part, solver, None, SolveLog(), candidates))
-        rest = rejected[~solution.accepted()[rejected]]
-        rejected = np.concatenate((rest, refuted_in_units(rejected)))
-    log.refined += len(rejected)
-    failed = refine(programs, solution, rejected)
-    if len(failed):
-        solution.put(failed, _solved(programs.take(failed), solver, None, SolveLog()))
-        failed = refuted_in_units(failed)
+        unsure = _refuted(scaled, in_units, rejected[again.accepted()])
+        failed = refine(programs, solution, unsure)
         solution.put(failed, programs.unsolved(Status.NOT_CONVERGED).at(failed))
+        log.refined += second.refined + len(unsure)
     return solution if lengths is None else lengths.restored(solution, programs.group)
 
 
