@@ -134,7 +134,7 @@ class BatchSolution(NamedTuple):
 
     def error(self) -> Array:
         """Return the larger one of the residual and the value's error, ``(B,)``."""
-        larger = np.maximum if isinstance(self.residual, np.ndarray) else torch.maximum
+        larger: Any = np.maximum if isinstance(self.residual, np.ndarray) else torch.maximum
         return larger(self.residual, self.value_error)
 
     def improve(self, index: Array, others: BatchSolution) -> None:
