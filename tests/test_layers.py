@@ -34,7 +34,7 @@ BUDGET = {
     "envs": 1394,
     "experiment": 3122,
     "export": 1244,
-    "learning": 2776,
+    "learning": 2777,
     "mpc": 5039,
     "proofs": 999,
     "qp": 5672,

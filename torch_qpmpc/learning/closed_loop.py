@@ -66,16 +66,17 @@ class SimulatedPlant:
         horizon: int = 0,
     ) -> None:
         self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
-        u, seen = torch.cat([one.u for one in log]), [filtered(x, log) for x in (*models, observer)]
-        noises = zip(*(_noise(x, u.numpy(), e) for x, e in seen[:-1]), strict=True)
+        seen = [filtered(model, log) for model in (*models, observer)]
+        self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
+        noises = zip(*(_noise(x, self._u.numpy(), e) for x, e in seen[:-1]), strict=True)
         self._residuals, self._growth = map(torch.stack, noises)
         self._horizon, n_y = horizon, self._residuals.shape[-1]
         self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
         steps = torch.tensor([one.steps for one in log])
         self._first = (steps.cumsum(0) - steps).repeat_interleave(steps)
         self._last = (steps.cumsum(0) - 1).repeat_interleave(steps)
-        self._d, self._y = torch.cat([one.d for one in log]), torch.cat([one.y[:-1] for one in log])
         self._seen = _stacked([x for x, _ in seen])
+        self._y = torch.cat([x.y[:-1] for x in log])
         self._rows = torch.arange(len(self._d))  # where loops start, if from the log
         self._from_log = self._d.shape[1] > 0
 
