@@ -447,8 +447,8 @@ def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
 
 
 def outcomes(rows: Any) -> str:
-    """Format the rows, each plant with the median and the worst of its logs."""
-    lines = []
+    """Format the rows: of each plant the median and the worst log, and how many are too dear."""
+    lines, worse, count = [], 0, 0
     for name in PLANTS:
         runs = rows[rows["plant"] == name]
         if not len(runs):
@@ -456,12 +456,13 @@ def outcomes(rows: Any) -> str:
         J = [float(runs[key].median()) for key in ("zero", "start")]
         J += [float(runs["start"].max()), float(runs["reference"].median())]
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
-        worse = (runs["excess"] > ERRORS * runs["error"]).sum()
+        worse += int((runs["excess"] > ERRORS * runs["error"]).sum())
+        count += len(runs)
         names = (x.removesuffix(", first log").removeprefix("MPC of the ") for x in runs["chosen"])
-        tail = [f"{worse} of {len(runs)}", "; ".join(dict.fromkeys(names))]
-        lines.append([name, *cells, *tail])
-    head = ["plant", "zero action", "start, median", "worst", "reference"]
-    return table([*head, "worse than zero action", "chosen"], lines)
+        lines.append([name, *cells, "; ".join(dict.fromkeys(names))])
+    head = ["plant", "zero action", "start, median", "worst", "reference", "chosen"]
+    total = f"In {worse} of {count} runs the start cost more than zero action."
+    return f"{table(head, lines)}\n\n{total}"
 
 
 def learning(rows: Any) -> str:

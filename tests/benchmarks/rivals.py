@@ -436,7 +436,8 @@ def drawn(rows: Any) -> Figure:
         axes.xaxis.set_minor_locator(NullLocator())
         J = own.groupby(["design", "transitions"])["J"].median()
         axes.set_ylim(0.8 * own["J"].min(), 1.2 * J.max())  # some worst seeds are far above
-        axes.legend(fontsize="x-small")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small")
     return figure
 
 
