@@ -350,7 +350,7 @@ class _Loops:
             through = (slopes[k][:, None] @ gains[k])[:, 0]
             slope = direct + torch.autograd.grad(self._known(s), s, through)[0]
         linear = (actions * slopes).sum()
-        return mean + linear - linear.detach()
+        return mean + (linear - linear.detach())
 
 
 @dataclass(frozen=True)
