@@ -204,7 +204,7 @@ def ensemble(identified: Identified, members: int, seed: int) -> list[Innovation
 
 
 def filtered(model: Innovations, log: Sequence[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the estimates in a log's steps ``(steps, n)`` and the innovations after them.
+    """Return the estimates ``(steps, n)`` of a log, and the innovations that follow them.
 
     Trajectories of equal length are filtered together.
     """

@@ -133,12 +133,12 @@ class BatchSolution(NamedTuple):
             own[index] = new
 
     def error(self) -> Array:
-        """Return the larger one of the residual and the value's error, ``(B,)``."""
+        """Return the larger of the residual and the value's error, ``(B,)``."""
         larger: Any = np.maximum if isinstance(self.residual, np.ndarray) else torch.maximum
         return larger(self.residual, self.value_error)
 
     def improve(self, index: Array, others: BatchSolution) -> None:
-        """Replace solutions at ``index`` with larger errors than the others', and placeholders."""
+        """Replace placeholders, and solutions with larger errors than the others', at ``index``."""
         nothing = ~(self.residual[index] < float("inf"))
         better = indices(nothing | (others.error() < self.error()[index]))
         self.put(index[better], others.at(better))

@@ -366,15 +366,15 @@ def _product(matrix: np.ndarray, x: Twice) -> Twice:
 def products(matrix, high, low):
     """Return compensated sums of matrix (high + low), and their errors (Ogita et al., 2005)."""
     m, n = matrix.shape
-    sums, errors, upper, kept = np.zeros(m), np.zeros(m), np.empty(n), np.empty(n, np.bool_)
+    sums, errors, upper, infinite = np.zeros(m), np.zeros(m), np.empty(n), np.empty(n, np.bool_)
     for j in range(n):
-        kept[j] = not np.isfinite(high[j] + low[j])
+        infinite[j] = not np.isfinite(high[j] + low[j])
         spread = SPLIT * high[j]
         upper[j] = spread - (spread - high[j])
     for i in range(m):
         for j in range(n):
             a, x = matrix[i, j], high[j]
-            if a == 0.0 and not kept[j]:
+            if a == 0.0 and not infinite[j]:
                 continue
             # The product and its error (Dekker), then the sum and its error (Knuth).
             product, spread, x_upper = a * x, SPLIT * a, upper[j]

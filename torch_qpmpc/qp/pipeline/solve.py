@@ -41,7 +41,7 @@ ON_FAILURE = ("raise", "warn", "mask")
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
-#: So many rejected QPs are refined one by one at once; of more, other eliminations come first.
+#: Up to this number, rejected QPs are refined one by one; of more, other eliminations come first.
 FEW = 8
 #: Number of iterative refinements after an alternative elimination.
 PASSES = 2
@@ -54,7 +54,7 @@ class SolveLog:
     Attributes:
         solves: QPs, solved or not.
         unsolved: QPs without a certified solution.
-        fallback: QPs that their solver and the refinement of a few do not solve.
+        fallback: QPs that their solver does not solve, nor a refinement in small batches.
         refined: rejected solutions that were refined in twice the working precision, which is slow.
         recalled: QPs solved by their warm start alone.
         iterations: the solvers' iterations.
@@ -295,10 +295,10 @@ def _solved(
 ) -> BatchSolution:
     """Try one strategy after the other on the QPs without a certified solution.
 
-    The first runs on their device. A few QPs that the solver leaves are refined and diagnosed, one
-    by one, and of many those that other eliminations, which take whole batches, leave: a QP that is
-    proved to have no solution is tried no further. A ``solution`` has candidates that were
-    rejected.
+    The first runs on their device. Up to `FEW` QPs that the solver leaves are refined and diagnosed
+    one by one; of more, those that the other eliminations leave, which solve whole batches. A QP
+    that is proved to have no solution is not tried again. ``solution`` holds candidates that were
+    rejected before.
     """
     status = np.full(len(programs), int(Status.NOT_CONVERGED))
     todo = programs.solvable() if solution is None else np.arange(len(programs))
