@@ -26,19 +26,19 @@ IMPORTS = {
     "train": "files",  # `python -m torch_qpmpc.train`
 }
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
-#: The most lines of Python in each folder; `.` is the package's own files.
+#: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 394,
+    ".": 400,
     "analysis": 851,
-    "control": 4296,
+    "control": 4500,
     "envs": 1394,
     "experiment": 3122,
-    "export": 1244,
-    "learning": 2777,
-    "mpc": 5039,
-    "proofs": 999,
+    "export": 1450,
+    "learning": 2900,
+    "mpc": 5300,
+    "proofs": 1000,
     "qp": 5672,
-    "study": 548,
+    "study": 550,
 }
 #: Libraries that only some layers may import.
 RESERVED = {
