@@ -27,9 +27,10 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc.control import exporting
 from torch_qpmpc.experiment.tasks import identified
 from torch_qpmpc.export import comparison, library
+from torch_qpmpc.identification import identification, subspace
+from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.learning import closed_loop
-from torch_qpmpc.mpc import identification, stage_cost, subspace
-from torch_qpmpc.mpc.log import Trajectory
+from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.qp.solvers import BACKENDS
 
 #: Resolution of the tests' figures.

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torch_qpmpc.identification.log import Log
+
+#: The signals of `room`.
+NAMES: Any = {"outputs": ["T"], "inputs": ["q"], "known": ["T_out"]}
 A = torch.tensor([[1.5, 0.1, -0.56, 0.0], [0.0, 1.2, 0.05, -0.35]]).double()
 B = torch.tensor([[0.5, 0.2], [0.1, 0.4]]).double()
 E = torch.tensor([[0.3], [-0.2]]).double()
@@ -50,3 +56,8 @@ def room(steps: int = 60, seed: int = 0) -> pd.DataFrame:
     for k in range(steps - 1):
         T[k + 1] = 0.9 * T[k] + 0.5 * q[k] + 0.1 * T_out[k]
     return pd.DataFrame({"t": 0.25 * np.arange(steps), "T": T, "q": q, "T_out": T_out})
+
+
+def lengths(log: Log) -> list[int]:
+    """Return the steps of each trajectory."""
+    return [part.steps for part in log.trajectories]

@@ -13,29 +13,31 @@ IMPORTS = {
     "files": "errors",
     "loops": "",  # the closed loop of a policy and a plant
     "qp": "errors checks",
-    "mpc": "errors checks files qp",
+    "identification": "errors checks qp",  # models from logs; knows no QPMPC
+    "mpc": "errors checks files qp identification",
     "export": "errors checks qp mpc",
     "proofs": "errors checks qp mpc export",
-    "learning": "errors checks qp mpc",
-    "envs": "errors checks loops mpc",
+    "learning": "errors checks qp identification mpc",
+    "envs": "errors checks loops identification mpc",
     "analysis": "errors checks qp mpc",
-    "control": "errors checks files loops qp mpc export learning analysis",
-    "experiment": "errors checks files qp mpc export learning envs analysis",
-    "study": "errors checks files qp mpc learning envs analysis experiment",
+    "control": "errors checks files loops qp identification mpc export learning analysis",
+    "experiment": "errors checks files qp identification mpc export learning envs analysis",
+    "study": "errors checks files qp identification mpc learning envs analysis experiment",
     "report": "study",  # `python -m torch_qpmpc.report`
     "train": "files",  # `python -m torch_qpmpc.train`
 }
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 400,
+    ".": 410,
     "analysis": 851,
     "control": 4500,
     "envs": 1394,
-    "experiment": 3122,
+    "experiment": 3123,
     "export": 1450,
     "learning": 2900,
-    "mpc": 5300,
+    "identification": 1800,
+    "mpc": 3489,
     "proofs": 1000,
     "qp": 5672,
     "study": 550,

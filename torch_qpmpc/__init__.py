@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from torch_qpmpc.control.controller import Controller
     from torch_qpmpc.control.linear_mpc import LinearMPC
     from torch_qpmpc.export.export import CompiledPolicy, export_c
+    from torch_qpmpc.identification.identification import identify
+    from torch_qpmpc.identification.reading import read_log
     from torch_qpmpc.learning.closed_loop import improve
     from torch_qpmpc.learning.gauss_newton import GaussNewton
     from torch_qpmpc.learning.operators import QPActorValueOperator
@@ -21,9 +23,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.mpc.blended import identify_blended
     from torch_qpmpc.mpc.bounds import Bounds
     from torch_qpmpc.mpc.cost import Cost
-    from torch_qpmpc.mpc.identification import identify
     from torch_qpmpc.mpc.layout import Layout
-    from torch_qpmpc.mpc.log import read_log
     from torch_qpmpc.mpc.model import Model
     from torch_qpmpc.mpc.module import QPMPC
     from torch_qpmpc.mpc.scheme import Scheme
@@ -87,11 +87,11 @@ if not TYPE_CHECKING:
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
         "envs": "torch_qpmpc.envs:",
         "export_c": "torch_qpmpc.export.export:export_c",
-        "identify": "torch_qpmpc.mpc.identification:identify",
+        "identify": "torch_qpmpc.identification.identification:identify",
         "identify_blended": "torch_qpmpc.mpc.blended:identify_blended",
         "improve": "torch_qpmpc.learning.closed_loop:improve",
         "load_run": "torch_qpmpc.study.runs:load_run",
-        "read_log": "torch_qpmpc.mpc.log:read_log",
+        "read_log": "torch_qpmpc.identification.reading:read_log",
         "solve_qp": "torch_qpmpc.qp.solve:solve_qp",
     }
 

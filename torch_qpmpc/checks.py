@@ -95,3 +95,15 @@ def check_tensor(
 def _shape(event: tuple[int | str, ...], batched: bool) -> str:
     parts = [*(["*batch"] if batched else []), *map(str, event)]
     return f"({', '.join(parts)}{',' if len(parts) == 1 else ''})"
+
+
+def ungraded(name: str, value: Any) -> Any:
+    """Return ``value``; raise `QPError` if it is or has a tensor whose gradient would be lost."""
+    parts = value.values() if isinstance(value, dict) else value
+    parts = parts if isinstance(value, dict | list | tuple) else ()
+    if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
+        remedy = f"Pass {name}.detach(): no gradient flows through this argument."
+        raise QPError.expected(name, "a tensor that requires grad", "one without", remedy)
+    for part in parts:
+        ungraded(name, part)
+    return value

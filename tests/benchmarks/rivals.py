@@ -51,8 +51,8 @@ from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
 from torch_qpmpc.experiment.tasks import Task, plant_layout, register
+from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
-from torch_qpmpc.mpc.identification import Identified
 from torch_qpmpc.study.markdown import replaced, table
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "rivals.csv"

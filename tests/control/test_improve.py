@@ -14,8 +14,8 @@ from tests.problems import central_difference
 from torch_qpmpc import QPError
 from torch_qpmpc.control import learning
 from torch_qpmpc.control.simulation import Run
+from torch_qpmpc.identification.log import Log
 from torch_qpmpc.learning.closed_loop import _Loops, ensemble
-from torch_qpmpc.mpc.log import Log
 
 LEARN = ("H", "H_f", "q", "b", "C", "lb", "ub")
 CASES = {

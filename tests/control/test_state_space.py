@@ -12,10 +12,10 @@ import torch
 
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
-from torch_qpmpc.mpc.identification import Identified
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import Log, Trajectory
-from torch_qpmpc.mpc.subspace import Fit
+from torch_qpmpc.identification.identification import Identified
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import Log, Trajectory
+from torch_qpmpc.identification.subspace import Fit
 
 A, B = np.array([[0.0, 1.0], [-1.0, -0.5]]), np.array([[0.0], [1.0]])
 C, D = np.array([[1.0, 0.0]]), np.array([[0.0]])

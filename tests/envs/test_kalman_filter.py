@@ -27,7 +27,7 @@ from torchrl.envs import (
 from tests.store import Store
 from torch_qpmpc.envs import KalmanFilter, PlantEnv
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 
 ID, STEPS = "Pendulum-v1", 7
 

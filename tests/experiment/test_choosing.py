@@ -38,9 +38,9 @@ from torch_qpmpc.experiment.logs import estimated
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.identification.steps import valid_steps
 from torch_qpmpc.learning.closed_loop import ensemble
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.riccati import terminal_riccati
 from torch_qpmpc.study.runs import FinishedRun
 

@@ -18,8 +18,8 @@ from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.start import collect_log, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpcs
+from torch_qpmpc.identification.identification import identify
 from torch_qpmpc.learning.replay import Replay
-from torch_qpmpc.mpc.identification import identify
 from torch_qpmpc.mpc.riccati import terminal_riccati
 from torch_qpmpc.mpc.stage_cost import fit_rewards
 

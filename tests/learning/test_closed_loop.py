@@ -12,8 +12,8 @@ import torch_qpmpc as qm
 from tests.problems import central_difference
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.learning.closed_loop import _Loops, growth, simulated_plant, stage_cost
-from torch_qpmpc.mpc.identification import Identified, identify
 
 
 def logged(loops: int = 8, steps: int = 60) -> Identified:

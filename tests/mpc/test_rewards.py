@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 from torch_qpmpc import QPMPC, Model, QPError, Scheme
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.stage_cost import fit_rewards, scheme_cost
 

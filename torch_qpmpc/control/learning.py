@@ -32,12 +32,13 @@ from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.identification.identification import Identified, identify
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import STILL, Log, Trajectory, folds
+from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlant, ensemble
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
-from torch_qpmpc.mpc.identification import Identified, identify
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import STILL, Log, Trajectory, as_log, folds
 from torch_qpmpc.mpc.scheme import KEYWORDS
 
 #: Number of parts that a log is cut into; the last one is held out.

@@ -12,7 +12,7 @@ from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.disturbance import check_observable
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1

@@ -11,8 +11,8 @@ import scipy.linalg
 
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.identification import Identified
-from torch_qpmpc.mpc.subspace import visited
+from torch_qpmpc.identification.identification import Identified
+from torch_qpmpc.identification.subspace import visited
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
 Array = np.ndarray

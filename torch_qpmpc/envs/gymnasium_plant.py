@@ -24,7 +24,7 @@ from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 from torch_qpmpc.checks import check_kind, check_seed, check_whole
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 
 #: The length of episodes of an environment that has no limit of its own.
 STEPS = 200

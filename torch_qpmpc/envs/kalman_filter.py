@@ -13,7 +13,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 
 #: The steps of an episode whose gains differ from the last one's, at most.
 STEPS = 1000
@@ -37,7 +37,7 @@ class KalmanFilter(Transform):
     Example:
         >>> import numpy as np
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from torch_qpmpc.mpc.innovations import Innovations
+        >>> from torch_qpmpc.identification.innovations import Innovations
         >>> A, zero = np.eye(3), np.zeros(3)
         >>> model = Innovations(A, np.ones((3, 1)), np.zeros((3, 0)), zero, A, A, A, zero, A)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), KalmanFilter(model))

@@ -22,7 +22,7 @@ from torch_qpmpc.checks import check_kind, check_tensor, check_whole
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import Rng, moved
 from torch_qpmpc.envs.vectorised import VectorisedEnv
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 
 #: The number of different episodes of signals.
 EPISODES = 1024

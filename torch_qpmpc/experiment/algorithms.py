@@ -19,6 +19,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.identification.steps import valid_steps
 from torch_qpmpc.learning.closed_loop import Descent, SimulatedPlant
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
@@ -31,7 +32,6 @@ from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificatio
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
 from torch_qpmpc.learning.updates import Update, entries_of_C, first_order, second_order
-from torch_qpmpc.mpc.log import valid_steps
 from torch_qpmpc.mpc.module import QPMPC
 
 

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase, pad
 
 from torch_qpmpc.envs import KalmanFilter
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import MEASURED, NEXT, cuts, valid_steps
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.steps import MEASURED, NEXT, cuts, valid_steps
 
 #: The largest size of an observation, relative to the largest in the first transitions.
 GROWTH = 1e6

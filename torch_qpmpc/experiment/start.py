@@ -20,9 +20,9 @@ from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
+from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.replay import Replay
-from torch_qpmpc.mpc.innovations import Innovations
 
 #: The share of the exploration that a second log adds to the actions of the best start.
 MIXED = 0.3

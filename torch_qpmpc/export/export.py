@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_choice, check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_choice, check_kind, check_tensor, check_whole, ungraded
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.comparison import Agreement, choose, compare, states
 from torch_qpmpc.export.library import Library, Steps, compiler, required_compiler
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import NEAR, REAL, Settings, header, sources, table_bytes
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import ungraded
 
 STORAGES = ("fast", "small")
 #: Largest share of the solvable states that may be uncertified.

@@ -23,14 +23,14 @@ from torch.optim.lr_scheduler import LinearLR
 
 from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.identification import Identified
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import Trajectory
+from torch_qpmpc.identification.subspace import fit_state_space
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
-from torch_qpmpc.mpc.identification import Identified
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import Trajectory
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parametrizations import Tied
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.subspace import fit_state_space
 
 #: The steps of a loop whose gains differ from the last one's, at most.
 STEPS = 1000

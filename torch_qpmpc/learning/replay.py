@@ -22,7 +22,7 @@ from torchrl.data import (
 )
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.subspace import EXACT
+from torch_qpmpc.identification.subspace import EXACT
 from torch_qpmpc.qp.program import UNKNOWN
 
 #: The keys of a transition's active sets: of Q(s, a), and of V(s+).

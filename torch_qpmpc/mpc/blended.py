@@ -24,11 +24,12 @@ from torch import Tensor, nn
 
 from torch_qpmpc.checks import check_tensor, check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.identification import check_excitation
+from torch_qpmpc.identification.identification import check_excitation
+from torch_qpmpc.identification.log import Trajectory, folds
+from torch_qpmpc.identification.reading import as_log
+from torch_qpmpc.identification.ridge import ridge
 from torch_qpmpc.mpc.layout import Layout, banded_matrix
-from torch_qpmpc.mpc.log import Trajectory, as_log, folds
 from torch_qpmpc.mpc.parameters import for_each
-from torch_qpmpc.mpc.ridge import ridge
 from torch_qpmpc.mpc.validation import as_tensor
 
 #: The numbers of centres among which the held-out prediction decides.

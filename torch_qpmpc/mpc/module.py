@@ -17,13 +17,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torch_qpmpc.checks import check_choice, check_kind, check_tensor
+from torch_qpmpc.checks import check_choice, check_kind, check_tensor, ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.identification.identification import measured_model, model_arguments
 from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
-from torch_qpmpc.mpc.identification import measured_model, model_arguments
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
@@ -40,7 +40,6 @@ from torch_qpmpc.mpc.validation import (
     check_one_model,
     check_pair,
     learned_entries,
-    ungraded,
 )
 from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE, AtRest

@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_qpmpc.checks import ungraded
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import LARGEST
+from torch_qpmpc.identification.ridge import ridge
+from torch_qpmpc.identification.steps import MEASURED, NEXT, logs, valid_steps
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import LARGEST, MEASURED, NEXT, logs, valid_steps
-from torch_qpmpc.mpc.ridge import ridge
-from torch_qpmpc.mpc.validation import ungraded
 
 #: Strengths of the ridge, down to those of costs without noise, and the share of the evidence's
 #: that is used: enough for collinear columns, and too little to bias others.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_tensor
+from torch_qpmpc.checks import check_tensor, ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import broadcast, to_dtype
 
@@ -95,18 +95,6 @@ def without_gradients(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **options)
 
     return run
-
-
-def ungraded(name: str, value: Any) -> Any:
-    """Return ``value``; raise `QPError` if it is or has a tensor whose gradient would be lost."""
-    parts = value.values() if isinstance(value, dict) else value
-    parts = parts if isinstance(value, dict | list | tuple) else ()
-    if isinstance(value, Tensor) and value.requires_grad and torch.is_grad_enabled():
-        remedy = f"Pass {name}.detach(): no gradient flows through this argument."
-        raise QPError.expected(name, "a tensor that requires grad", "one without", remedy)
-    for part in parts:
-        ungraded(name, part)
-    return value
 
 
 def read_numbers(name: str, value: Any) -> Tensor:

@@ -31,7 +31,7 @@ from torch_qpmpc.experiment.run_folder import NUMBERS, learned_qp, read_metrics,
 from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.code import has_run
-from torch_qpmpc.mpc.innovations import Innovations
+from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 

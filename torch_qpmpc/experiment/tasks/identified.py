@@ -17,13 +17,15 @@ from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
+from torch_qpmpc.identification.identification import Identified, check_excitation, measured_model
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.reading import as_log
+from torch_qpmpc.identification.steps import valid_steps
+from torch_qpmpc.identification.subspace import fit_state_space
 from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
-from torch_qpmpc.mpc.identification import Identified, check_excitation, measured_model
-from torch_qpmpc.mpc.innovations import Innovations
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.log import as_log, valid_steps
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.projections import nearest_psd
@@ -35,7 +37,6 @@ from torch_qpmpc.mpc.riccati import (
 )
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.stage_cost import GOOD, LEFT, StageCost, fit_rewards, missed, poor, scheme_cost
-from torch_qpmpc.mpc.subspace import fit_state_space
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 if TYPE_CHECKING:

@@ -21,9 +21,9 @@ import numpy as np
 import scipy  # imports its parts at their first use: a fifth of a second
 import torch
 
-from torch_qpmpc.mpc.innovations import Array, Innovations
-from torch_qpmpc.mpc.log import Trajectory, folds
-from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.identification.innovations import Array, Innovations
+from torch_qpmpc.identification.log import Trajectory, folds
+from torch_qpmpc.identification.ridge import ridge
 from torch_qpmpc.qp.kernels.linalg import compiled
 
 #: Iterations of expectation maximisation, of a candidate and of the fit, and the gain of the

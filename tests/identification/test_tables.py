@@ -1,3 +1,5 @@
+"""Logs from CSV files, DataFrames and arrays."""
+
 from __future__ import annotations
 
 import warnings
@@ -7,24 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from tensordict import TensorDict, lazy_stack
 from torch.testing import assert_close
-from torchrl.collectors.utils import split_trajectories
 
 import torch_qpmpc as qm
-from tests.logs import arx_log, room
+from tests.logs import NAMES, arx_log, lengths, room
 from torch_qpmpc import QPError
-from torch_qpmpc.mpc.log import Log, as_log, folds
-
-NAMES: Any = {"outputs": ["T"], "inputs": ["q"], "known": ["T_out"]}
-
-
-def steps_of(log: Any) -> list[int]:
-    return [part.steps for part in as_log(log).trajectories]
-
-
-def lengths(log: Log) -> list[int]:
-    return [part.steps for part in log.trajectories]
+from torch_qpmpc.identification.log import Log
 
 
 def same(one: Log, other: Log) -> bool:
@@ -138,76 +128,6 @@ def test_a_signal_may_have_any_name(names):
     assert qm.read_log({"y": u, "u": u**2, "d": np.arange(30)}, time="d").known == ()
 
 
-# Times
-
-
-def clock(text: str | None = None, start: str = "2020-09-01", freq: str = "15min") -> Any:
-    times = pd.date_range(start, periods=60, freq=freq)
-    return times if text is None else times.strftime(text)
-
-
-STEPS = pd.to_timedelta(900 * np.arange(60), unit="s")
-PERIODS = pd.period_range("2020-09-01", periods=60, freq="15min")
-
-
-@pytest.mark.parametrize(
-    "times",
-    [
-        *(clock(), clock().tz_localize("Europe/Berlin"), STEPS, PERIODS, 900 * np.arange(60)),
-        *(clock().to_pydatetime().astype(object), STEPS.to_pytimedelta()),
-        *(clock().astype(str), clock("%Y-%m-%dT%H:%MZ"), clock("%b %d, %Y %I:%M %p")),
-        clock().floor("h"),  # four rows an hour
-    ],
-    ids=lambda times: f"{type(times).__name__} {times[0]}",
-)
-@pytest.mark.parametrize("place", ["index", "column"])
-def test_times_are_read_from_a_column_or_the_index(times, place):
-    frame, number = room(), not hasattr(times, "freq") or isinstance(times[0], str)
-    frame = frame.assign(t=times)
-    if place == "index" and not number:
-        frame = frame.set_index("t")
-    frame = frame.iloc[np.r_[:20, 30:60]]
-    log = qm.read_log(frame, **NAMES, time="t" if number or place == "column" else None)
-    assert (lengths(log), log.dt) == ([19, 29], 900)
-
-
-FORMATS = ("%d/%m/%Y %H:00", "%d.%m.%y %H:%M:%S", "%m/%d/%Y %H:%M", "%d-%m-%Y %H:%M")
-
-
-@pytest.mark.parametrize("text", FORMATS)
-@pytest.mark.parametrize("start", ["2020-09-29 13:45", "2020-09-02", "2020-09-12 20:00"])
-@pytest.mark.parametrize("freq", ["15min", "h", "6h"])
-def test_dates_may_begin_with_the_day(text, start, freq):
-    """Where both readings are dates with other gaps, a warning says so."""
-    frame = room().assign(t=clock(text, start, freq))
-    dt = {"15min": 900, "h": 3600, "6h": 21600}[freq]
-    options: Any = {**NAMES, "time": "t"}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        log = qm.read_log(frame, **options)
-    assert (lengths(log), log.dt) == ([59], dt)
-    days = {(x.day, x.month) for x in clock(None, start, freq)}
-    said = [str(x.message) for x in caught]
-    ambiguous = len(days) > 1 and all(max(pair) <= 12 for pair in days)
-    ambiguous = bool(said) if "%y" in text else ambiguous  # pandas guesses row by row
-    first = text.startswith("%d")
-    assert [f"day_first={first}" in x for x in said] == [True] * ambiguous
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert qm.read_log(frame, **options, day_first=first).dt == dt
-
-
-def test_a_clock_of_whole_seconds_may_show_a_time_twice():
-    frame = room(100)
-    for dt in (0.5, 0.4, 0.25, 0.1):
-        frame["t"] = np.floor(dt * np.arange(100) + 0.01)
-        assert (lengths(log := qm.read_log(frame, **NAMES, time="t")), log.dt) == ([99], dt)
-    frame.loc[50:, "t"] += 2
-    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [49, 49]
-    with pytest.raises(QPError, match=r"^time: got steps of 0, expected times that increase"):
-        qm.read_log(frame.assign(t=3.0), **NAMES, time="t")
-
-
 # Gaps, marks and missing numbers
 
 
@@ -227,14 +147,6 @@ def test_gaps_marks_and_missing_numbers_end_trajectories():
     assert_close(
         log.trajectories[1].y[:, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
     )
-
-
-def test_jitter_is_no_gap_and_a_step_back_is_one():
-    frame = room()
-    frame["t"] += 0.05 * np.random.default_rng(0).random(60)
-    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [59]
-    frame.loc[30:, "t"] -= 10
-    assert lengths(qm.read_log(frame, **NAMES, time="t")) == [29, 29]
 
 
 # What is wrong with columns
@@ -354,133 +266,3 @@ def test_plain_data_are_identified_and_start_a_qp():
         qm.identify(log, 4, n_d=2)
     with pytest.raises(QPError, match=r"^n_x: got 2, but 1 of T, expected the log's own"):
         qm.identify(log, 4, n_x=2)
-
-
-# Steps of TorchRL
-
-
-def test_a_log_is_read_in_order():
-    log = arx_log()
-    found = as_log(log, n_d=1).trajectories
-    assert len(found) == 3
-    for i, (y, u, d) in enumerate(found):
-        assert torch.equal(y[:-1], log["observation"][i])
-        assert torch.equal(y[1:], log["next", "observation"][i])
-        assert torch.equal(u, log["action"][i])
-        assert torch.equal(d, log["preview"][i, :, :1])
-
-
-def test_trajectories_end_at_flags_ids_and_other_observations():
-    log = arx_log()
-    log["next", "truncated"] = torch.zeros(3, 40, 1, dtype=torch.bool)
-    log["next", "truncated"][0, 9] = True
-    log["collector"] = TensorDict({"traj_ids": torch.zeros(3, 40, dtype=torch.int64)}, [3, 40])
-    log["collector", "traj_ids"][1, 25:] = 1
-    log["observation"][2, 7] += 1
-    assert steps_of(log) == [10, 30, 25, 15, 7, 33]
-
-
-def test_logs_of_different_lengths_are_read():
-    log = arx_log()
-    parts = [log[0], log[1, :30]]
-    assert steps_of(lazy_stack(parts)) == steps_of(parts) == [40, 30]  # pyright: ignore[reportArgumentType] (a list)
-    assert steps_of(lazy_stack([log[0], log[1]])) == [40, 40]
-    with pytest.raises(
-        QPError, match=r"^trajectories: got logs of \(n_x, n_u\) = \(1, 1\), \(2, 1\), "
-    ):
-        as_log(
-            [
-                log[0],
-                change("observation", lambda x: x[..., :1])(
-                    change(("next", "observation"), lambda x: x[..., :1])(log[1])
-                ),
-            ]
-        )
-
-
-def test_padded_steps_are_left_out():
-    log: Any = arx_log(episodes=1)[0]
-    log.set("traj_ids", (torch.arange(40) >= 12).long())
-    padded = split_trajectories(log, trajectory_key="traj_ids")
-    assert padded.shape == (2, 28)
-    assert steps_of(padded) == [12, 28]
-    padded["action"][0, 20] = torch.nan
-    assert steps_of(padded) == [12, 28]
-
-
-def test_folds_hold_each_step_once():
-    data = as_log(arx_log(), n_d=1).trajectories
-    parts = folds(data, 7)
-    sizes = [sum(trajectory.steps for trajectory in part) for part in parts]
-    assert sum(sizes) == 120
-    assert max(sizes) - min(sizes) <= 1
-    actions = [trajectory.u for part in parts for trajectory in part]
-    assert_close(torch.cat(actions), torch.cat([trajectory.u for trajectory in data]))
-    assert all(len(t.y) == t.steps + 1 for part in parts for t in part)
-
-
-def change(key, value):
-    def changed(log: TensorDict) -> TensorDict:
-        return log.set(key, value(log.get(key)))
-
-    return changed
-
-
-def spoilt(index: tuple[int, ...], number: float):
-    def changed(value):
-        value[index] = number
-        return value
-
-    return changed
-
-
-@pytest.mark.parametrize(
-    ("mistake", "message"),
-    [
-        (lambda log: log.exclude("action"), "trajectories: got only .*, expected an entry action"),
-        (
-            lambda log: log.exclude(("next", "observation")),
-            r"trajectories: got only .*, expected an entry next\.observation. Pass logged steps",
-        ),
-        (
-            lambda log: log.exclude("preview"),
-            "trajectories: got only .*, expected an entry preview",
-        ),
-        (lambda log: log[0, 0], r"trajectories: got shape \(\), expected shape \(T,\) or \(epi"),
-        (
-            change("action", spoilt((1, 5, 0), torch.nan)),
-            r"action: got nan at step \(1, 5\), entry 0, expected finite numbers. Cut the steps",
-        ),
-        (
-            change("observation", spoilt((2, 3, 1), torch.inf)),
-            r"observation: got inf at step \(2, 3\), entry 1, expected finite numbers",
-        ),
-        (
-            change("action", lambda x: x[..., 0]),
-            r"action: got shape \(3, 40\), expected a real tensor \(3, 40, 'n'\)",
-        ),
-        (
-            change("observation", lambda x: x[..., :1]),
-            r"next\.observation: got 2 entries, but 1 in observation, expected the same number",
-        ),
-        (
-            change("preview", lambda x: x[..., :0]),
-            r"preview: got shape \(3, 40, 0\), expected a real tensor \(3, 40, 'n'\) with n >= 1",
-        ),
-        (
-            lambda log: log.set(("next", "done"), torch.zeros(3, 40, 2, dtype=torch.bool)),
-            r"next\.done: got shape \(3, 40, 2\), expected shape \(3, 40\) or \(3, 40, 1\)",
-        ),
-        (
-            change("observation", lambda x: 1e155 * x),
-            r"observation: got .*e\+155, expected numbers up to 1e.100. Squares .* larger units",
-        ),
-        (
-            lambda log: log.set("mask", torch.zeros(3, 40, dtype=torch.bool)),
-            "trajectories: got no steps, expected logged steps",
-        ),
-    ],
-)
-def test_bad_data_are_named(mistake, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        as_log(mistake(arx_log()), n_d=1)

@@ -7,10 +7,10 @@ import pytest
 import scipy.linalg
 import torch
 
-from torch_qpmpc.mpc import subspace
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import Trajectory
-from torch_qpmpc.mpc.subspace import fit_state_space, held_out_errors, whiteness
+from torch_qpmpc.identification import subspace
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import Trajectory
+from torch_qpmpc.identification.subspace import fit_state_space, held_out_errors, whiteness
 
 A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 1.0]])

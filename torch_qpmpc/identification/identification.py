@@ -1,6 +1,6 @@
 """Identification of a linear model with its noise from logged trajectories, and its errors.
 
-`torch_qpmpc.mpc.subspace` has the mathematics.
+`torch_qpmpc.identification.subspace` has the mathematics.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_whole
+from torch_qpmpc.checks import check_whole, ungraded
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.innovations import Innovations
-from torch_qpmpc.mpc.log import Log, as_log
-from torch_qpmpc.mpc.subspace import (
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.log import Log
+from torch_qpmpc.identification.reading import as_log
+from torch_qpmpc.identification.subspace import (
     Fit,
     explained_by_inputs,
     fit_state_space,
     held_out_errors,
     whiteness,
 )
-from torch_qpmpc.mpc.validation import ungraded
 
 #: Steps of a prediction by default.
 HORIZON = 20

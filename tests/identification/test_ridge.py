@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from torch_qpmpc.mpc.ridge import ridge
+from torch_qpmpc.identification.ridge import ridge
 
 
 def problem(n: int, m: int = 5, noise: float = 0.1, seed: int = 0):

@@ -1,0 +1,1 @@
+"""Linear models with their noise, from logs of a plant."""

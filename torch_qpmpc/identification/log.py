@@ -1,0 +1,106 @@
+"""Trajectories of a plant with the names of their signals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torch_qpmpc.errors import QPError
+
+#: The largest magnitude, whose squares are finite.
+LARGEST = 1e100
+#: A column is constant, or a linear function of others, up to this share of its size.
+STILL = 1e-6
+
+
+class Trajectory(NamedTuple):
+    """Consecutive steps in float64: y ``(T + 1, n_x)``, u ``(T, n_u)`` and d ``(T, n_d)``."""
+
+    y: Tensor
+    u: Tensor
+    d: Tensor
+
+    @property
+    def steps(self) -> int:
+        """The number of steps, T."""
+        return self.u.shape[0]  # len takes ten times as long
+
+    def between(self, start: int, stop: int) -> Trajectory:
+        """Return the steps start, .., stop - 1."""
+        return Trajectory(self.y[start : stop + 1], self.u[start:stop], self.d[start:stop])
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Trajectories with the names of their signals; ``print`` shows what `read_log` did.
+
+    Attributes:
+        trajectories: consecutive steps: outputs y, inputs u and known signals d.
+        outputs, inputs, known: the names of the entries of y, u and d.
+        units: units by name, where known.
+        dt: the time between steps, in the unit of the time column or in seconds; None without one.
+        notes: sentences on what was split, left out or noticed.
+    """
+
+    trajectories: Sequence[Trajectory]
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    known: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    dt: float | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def steps(self) -> int:
+        """The number of steps of all trajectories."""
+        return sum(trajectory.steps for trajectory in self.trajectories)
+
+    def label(self, name: str) -> str:
+        """Return ``name`` with its unit, as ``T [degC]``."""
+        return f"{name} [{self.units[name]}]" if name in self.units else name
+
+    def __str__(self) -> str:
+        signals = {"outputs": self.outputs, "inputs": self.inputs, "known": self.known}
+        named = "; ".join(
+            f"{kind} {', '.join(map(self.label, names))}"
+            for kind, names in signals.items()
+            if names
+        )
+        every = "" if self.dt is None else f", one step every {self.dt:g}"
+        return "\n".join((f"{self.steps} steps{every}: {named}", *self.notes))
+
+
+def named(
+    trajectories: Sequence[Trajectory],
+    outputs: Sequence[str] | None = None,
+    inputs: Sequence[str] | None = None,
+    known: Sequence[str] | None = None,
+) -> Log:
+    """Return the log of trajectories, by default with the names y1, .., u1, .. and d1, ..."""
+    names = []
+    for kind, part in {"outputs": outputs, "inputs": inputs, "known": known}.items():
+        letter, size = "yud"[len(names)], trajectories[0][len(names)].shape[-1]
+        if part is not None and len(part) != size:
+            raise QPError.expected(kind, f"{list(part)}", f"{size} names")
+        names.append(tuple(part or (f"{letter}{i + 1}" for i in range(size))))
+    return Log(trajectories, *names)
+
+
+def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
+    """Cut all steps into ``count`` consecutive parts of nearly equal length."""
+    total = sum(trajectory.steps for trajectory in trajectories)
+    bounds = [total * i // count for i in range(count + 1)]
+    parts: list[list[Trajectory]] = [[] for _ in range(count)]
+    begin = 0
+    for trajectory in trajectories:
+        steps = trajectory.steps
+        for part, first, last in zip(parts, bounds[:-1], bounds[1:], strict=True):
+            start, stop = max(first - begin, 0), min(last - begin, steps)
+            if start < stop:
+                whole = stop - start == steps
+                part.append(trajectory if whole else trajectory.between(start, stop))
+        begin += steps
+    return parts

@@ -1,0 +1,231 @@
+"""Logs of CSV files, DataFrames and arrays, and the faults of their columns."""
+
+from __future__ import annotations
+
+import csv
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from torch_qpmpc.checks import ungraded
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds
+from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory
+
+#: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away.
+FAR = 10
+#: The column of a DataFrame's index of times.
+TIME_INDEX = "the index"
+#: A column's header with its unit, as in ``T [degC]``.
+HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
+KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
+
+
+def read_tables(
+    data: Any,
+    signals: Sequence[Sequence[str] | None],
+    time: str | None,
+    episode: str | None,
+    day_first: bool | None,
+) -> Log:
+    """Return the log of tables with the ``signals`` (outputs, inputs, known); see `read_log`."""
+    frames = [_frame(part) for part in (data if isinstance(data, list | tuple) else [data])]
+    if not frames:
+        raise QPError.expected("data", "an empty list", KINDS)
+    marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
+    frame = pd.concat(frames, ignore_index=True)
+    headers = [HEADER.fullmatch(str(header)) for header in frame.columns]
+    units = {match[1]: match[2] for match in headers if match}
+    frame.columns = [_bare(header) for header in frame.columns]
+    chosen = [[x] if isinstance(x, str) else x for x in signals]
+    taken = {time, episode, *(name for names in chosen for name in names or ())}
+    kinds = zip(chosen, "yud", ("outputs", "inputs", "known"), strict=True)
+    y, u, d = (_columns(frame, *kind, taken) for kind in kinds)
+    names = (*y, *u, *d)
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise QPError.expected("column", f"{twice[0]!r} twice", "each once")
+    (values, words), times = _numbers(frame, names), _times(frame, time, day_first)
+    if episode is not None:
+        column = _column(frame, episode)
+        marks = marks + (column != column.shift()).cumsum().to_numpy()
+    trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)))
+    usual = values[(np.abs(values) <= LARGEST).all(1)]
+    if noticed := (*_marked(usual, names), *_dependent(usual, names)):
+        warnings.warn(f"In this log, {'; '.join(noticed)}.", UserWarning, stacklevel=3)
+    units = {name: x for name, x in units.items() if name in names}
+    return Log(trajectories, y, u, d, units, dt, (note, *words, *noticed))
+
+
+def _split(
+    values: Any, times: np.ndarray | None, marks: Any, sizes: tuple[int, int, int]
+) -> tuple[list[Trajectory], float | None, str]:
+    """Return the trajectories in rows ``values`` [y, u, d], the time of a step, and a note."""
+    n_y = sizes[0]
+    fits = np.abs(values) <= LARGEST  # False for NaN
+    whole, measured = fits.all(1), fits[:, :n_y].all(1)
+    inside = marks[1:] == marks[:-1]
+    gaps, dt = gaps_of(times, inside, marks)
+    steps = whole[:-1] & measured[1:] & inside & ~gaps
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
+    if not len(edges):
+        got = f"{len(values)} rows, of which no two in a row are complete"
+        raise QPError.expected("data", got, "consecutive rows with a number in each column")
+    used = np.concatenate((steps, [False])) | np.concatenate(([False], steps))
+    y, u, d = torch.as_tensor(values).split(sizes, dim=1)
+    trajectories = [Trajectory(y[i : k + 1], u[i:k], d[i:k]) for i, k in edges.tolist()]
+    counted = f"{_count(gaps.sum(), 'gap')}, {_count(len(edges), 'trajectory')}"
+    note = f"{_count(len(values), 'row')}: {counted}, {1 - used.mean():.1%} of rows dropped"
+    return trajectories, dt, note
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun if number == 1 else f'{noun}s'.replace('ys', 'ies')}"
+
+
+def _frame(part: Any) -> pd.DataFrame:
+    if isinstance(part, str | Path):
+        try:
+            return _read_csv(Path(part))
+        except (OSError, ValueError, Warning) as error:
+            got = f"{part}, which cannot be read ({error})"
+            raise QPError.expected("data", got, "a CSV file") from error
+    if isinstance(part, pd.DataFrame):
+        timed = isinstance(part.index, pd.DatetimeIndex | pd.TimedeltaIndex | pd.PeriodIndex)
+        return part.assign(**{TIME_INDEX: part.index}) if timed else part.copy()
+    if not isinstance(part, Mapping):
+        raise QPError.expected("data", type(part).__name__, KINDS)
+    columns: dict[str, pd.Series] = {}
+    for name, value in part.items():
+        array = np.asarray(ungraded(str(name), value))
+        if array.ndim not in (1, 2):
+            raise QPError.expected(str(name), f"shape {array.shape}", "shape (T,) or (T, n)")
+        for i, column in enumerate(array.reshape(len(array), -1).T):
+            single = array.ndim == 1 or array.shape[1] == 1
+            columns[name if single else f"{name}{i + 1}"] = pd.Series(column)
+    longest = max((len(column) for column in columns.values()), default=0)
+    for name, column in columns.items():
+        if len(column) < longest - 1:
+            expected = f"{longest} rows, as others, or {longest - 1}"
+            raise QPError.expected(str(name), f"{len(column)} rows", expected)
+    return pd.DataFrame(columns)  # which fills a missing last row with NaN
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    """Read a CSV file by its header; an empty field beyond that is a delimiter too many."""
+    with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
+        warnings.simplefilter("error", pd.errors.ParserWarning)  # that fields would be lost
+        header = next(filter(None, csv.reader(file, skipinitialspace=True)), [])
+        file.seek(0)  # no address in the internet
+        frame = pd.read_csv(file, index_col=False, skipinitialspace=True, low_memory=False)
+    return frame.set_axis(header, axis=1)  # without pandas's other names for what is there twice
+
+
+def _bare(header: Any) -> str:
+    """Return a header without its unit."""
+    return HEADER.sub(r"\1", str(header)).strip()
+
+
+def _columns(
+    frame: pd.DataFrame, names: Sequence[str] | None, default: str, kind: str, taken: set[Any]
+) -> tuple[str, ...]:
+    """Return the columns of ``names``; ``y`` may stand for ``y1``, ``y2``, ..."""
+    present = [x for x in frame.columns if names is not None or x not in taken]
+    columns = []
+    for name in names or [default]:
+        numbered = [x for x in present if re.fullmatch(rf"{re.escape(name)}\d+", x)]
+        columns += [name] if name in present or (names and not numbered) else numbered
+    if not columns and kind != "known":
+        got = f"none, and columns {', '.join(frame.columns)}"
+        remedy = f"Pass read_log(.., {kind}=[..])."
+        raise QPError.expected(kind, got, f"names of columns, or {default}1, ..", remedy)
+    return tuple(columns)
+
+
+def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    """Return the columns as float64, with NaN for words, and notes on these.
+
+    Text with digits that is no number would be lost, and is refused.
+    """
+    values, notes = np.empty((len(frame), len(names))), []
+    for i, name in enumerate(names):
+        column = _column(frame, name)
+        numbers: Any = pd.to_numeric(column, errors="coerce")
+        values[:, i] = np.asarray(numbers, dtype=float)
+        words = column[numbers.isna() & column.notna()].astype(str)
+        odd = words[words.str.contains(r"\d") & (words.map(_bare) != name)]
+        if len(odd):
+            got, want = f"{name} with {odd.iloc[0]!r} in {_count(len(odd), 'row')}", "1234.5"
+            remedy = (
+                "Pass a DataFrame: pandas.read_csv(.., decimal=',') reads decimal commas, and "
+                "thousands=',' separators; units belong in the header, as in 'q [kW]'."
+            )
+            raise QPError.expected("column", got, want, remedy)
+        if not np.isfinite(values[:, i]).any():
+            got = f"{name}, without a number"
+            raise QPError.expected("column", got, "a column of numbers")
+        if len(words):
+            rows = _count(len(words), "row")
+            notes.append(f"{name} is no number in {rows}, as in {words.iloc[0]!r}")
+    return values, notes
+
+
+def _column(frame: pd.DataFrame, name: str) -> Any:
+    count = list(frame.columns).count(name)
+    if count != 1:
+        got = f"{name!r}, which is {'missing' if count == 0 else 'there twice'}"
+        expected = f"one of {', '.join(dict.fromkeys(frame.columns))}"
+        raise QPError.expected("column", got, expected)
+    return frame[name]
+
+
+def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.ndarray | None:
+    """Return the times in seconds or the column's unit; None without a column of times."""
+    if name is None and TIME_INDEX not in frame.columns:
+        return None
+    column = _column(frame, name or TIME_INDEX).infer_objects()
+    if column.dtype.kind not in "mM" and not isinstance(column.dtype, pd.PeriodDtype):
+        column = column.where(column.astype(str).map(_bare) != column.name)  # a header in between
+    return seconds(column, day_first)
+
+
+def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Name the columns with a number that repeats and is far from all others, as -9999."""
+    notes = []
+    for name, column in zip(names, values.T, strict=True):
+        x, counts = np.unique(column, return_counts=True)
+        if counts[1:-1].sum() < FEWEST or not np.ptp(x[1:-1]):
+            continue
+        far = (np.diff(x)[[0, -1]] > FAR * np.ptp(x[1:-1])) & (counts[[0, -1]] > 1)
+        notes += [
+            f"{name} is {x[end]:.6g} in {counts[end]} rows, far from all others, which may mark "
+            "missing numbers: replace them by NaN"
+            for end in np.array([0, -1])[far]
+        ]
+    return notes
+
+
+def _dependent(values: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Name the columns that are constant or a linear function of columns before them."""
+    middle = values.mean(0)
+    X = values - middle
+    size = np.sqrt(np.square(X).mean(0))
+    notes: list[str] = []
+    kept: list[int] = []
+    for i, name in enumerate(names):
+        if size[i] <= STILL * abs(middle[i]):
+            notes.append(f"{name} is constant at {middle[i]:.6g}")
+            continue
+        x, others = X[:, i] / size[i], X[:, kept] / size[kept]
+        weights = np.linalg.lstsq(others, x, rcond=None)[0]
+        if len(X) > len(names) and np.sqrt(np.square(x - others @ weights).mean()) <= STILL:
+            of = [names[j] for j, weight in zip(kept, weights, strict=True) if abs(weight) > STILL]
+            notes.append(f"{name} is a linear function of {', '.join(of)}")
+        else:
+            kept.append(i)
+    return notes
