@@ -8,6 +8,7 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+import scipy.signal
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError, SolverError
@@ -177,7 +178,7 @@ def test_logs_of_other_signals_or_steps_and_constant_signals_are_named():
     controller = made(WRONG, E=[[0.1]], known=["sun"])
     with pytest.raises(QPError, match=r"^known: got a constant sun, expected one that varies"):
         controller.learn(Lag(), known=[0.3], **{**QUICK, "transitions": 12})
-    controller = made(WRONG, dt=30.0)
+    controller = made(scipy.signal.dlti(*WRONG, [[1.0]], [[0.0]], dt=30.0))
     with pytest.raises(QPError, match=r"^log: got one step every 60, expected .* 30. Resample"):
         controller.learn(logged(dt=60.0))
     assert controller.learn(logged(dt=30.0), steps=8).accepted

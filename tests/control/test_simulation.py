@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import gymnasium
 import numpy as np
 import pytest
+import scipy.signal
 from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
@@ -145,7 +146,8 @@ def test_an_environment_forecasts_the_known_signals():
 
 
 def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
-    mpc = qm.LinearMPC(LAG, 5, Q=1.0, E=[[0.1]], known=["rain"], y_bounds=(-1, 1), dt=60.0)
+    model = scipy.signal.dlti(*LAG, [[1.0]], [[0.0]], dt=60.0)
+    mpc = qm.LinearMPC(model, 5, Q=1.0, E=[[0.1]], known=["rain"], y_bounds=(-1, 1))
     figure = qm.Controller(mpc).simulate(steps=5, r=[0.5], known=[0.1]).plot()
     assert isinstance(figure, Figure)
     assert [axes.get_ylabel() for axes in figure.axes] == ["y1", "u1", "rain"]

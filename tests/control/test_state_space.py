@@ -36,6 +36,12 @@ def test_a_continuous_system_is_sampled_by_zero_order_hold():
     assert np.array_equal(twin.A, plant.A)
 
 
+def test_known_signals_of_a_continuous_system_are_sampled_with_it():
+    plant = read_model(scipy.signal.lti(A, B, C, D), E=3 * B, dt=0.2)
+    assert np.allclose(plant.E, 3 * plant.B)
+    assert np.array_equal(read_model(system(dt=0.2), E=3 * B).E, 3 * B)
+
+
 def test_a_discrete_system_keeps_its_matrices_and_time():
     plant = read_model(scipy.signal.dlti(A, B, C, D, dt=0.5))
     assert np.array_equal(plant.A, A)
@@ -73,6 +79,8 @@ def test_the_state_space_of_an_identification_has_its_predictions():
         assert np.array_equal(getattr(plant, name), parts[name])
     with pytest.raises(QPError, match=r"^dt: got 1.0, expected the model's own 0.5. Leave dt out"):
         read_model(found, dt=1.0)
+    with pytest.raises(QPError, match=r"^E: got \[1.0\], expected None, as the identification has"):
+        read_model(found, E=[1.0])
     seen = model.estimates(y.numpy(), u.numpy(), d.numpy())[:-1]
     x = seen @ model.A.T + model.inputs(u.numpy(), d.numpy())
     assert plant.visited is not None
@@ -95,6 +103,9 @@ def test_the_state_space_of_an_identification_has_its_predictions():
         (system(), {"dt": -1.0}, "dt: got -1.0, expected a sampling time > 0"),
         (system(dt=None), {"dt": 1.0}, "model: got no time base, .* Set model.dt: 0 if it is"),
         (system(dt=0.1), {"dt": 0.2}, "dt: got 0.2, expected the model's own 0.1"),
+        ((A, B, C), {"dt": 20}, r"dt: got 20 with matrices, expected None: .* scipy.signal.lti\(A"),
+        (read_model((A, B)), {"dt": 0.1}, "dt: got 0.1, expected None, as a StateSpace"),
+        (read_model((A, B)), {"known": ["d"]}, r"known: got \['d'\], expected None"),
         ((A, [1.0, 2.0]), {}, r"model\[1\]: got shape \(2,\), expected a matrix"),
         ((A, np.ones((3, 1))), {}, r"B: got shape \(3, 1\), expected \(2, 1\)"),
         ((A, B, np.ones((1, 3))), {}, r"C_y: got shape \(1, 3\), expected \(1, 2\)"),

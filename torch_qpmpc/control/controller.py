@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -207,28 +206,31 @@ class Controller:
         self._memory, self.status = law.observed(self._memory, measured, applied, ahead)
 
     def redesign(self, **changes: Any) -> None:
-        """Change bounds and weights between two steps; the estimates and the last input stay.
+        """Change weights, bounds and the filter between two steps; the estimates stay.
 
-        The observer also stays: it follows from the bounds that the controller was made with.
+        So does the last input, and what is not named. Without ``noise`` and ``drift`` the observer
+        stays: it follows from the bounds that the controller was made with.
 
         Args:
             changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
-                ``du_bounds`` and ``y_slack`` of `LinearMPC`; the others stay.
+                ``du_bounds`` and ``y_slack`` of `LinearMPC`, and ``noise`` and ``drift``. A mapping
+                changes the signals that it names; None in it removes a bound or a weight, or asks
+                for the default of a price or a deviation.
 
         Raises:
             QPError: an argument is invalid, or the MPC learns.
 
         Example:
             >>> import torch_qpmpc as qm
-            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+            >>> model = ([[0.9]], [[0.5, 0.5]])
+            >>> mpc = qm.LinearMPC(model, 10, Q=1.0, dR=0.1, u_bounds=(-0.3, 0.3))
             >>> controller = qm.Controller(mpc)
-            >>> controller.redesign(u_bounds=(-0.2, 0.2))
-            >>> controller.step([0.0], r=[1.0])
-            array([0.2])
+            >>> controller.redesign(u_bounds={"u1": (-0.2, 0.2)}, noise=0.05)
+            >>> controller.step([0.0], r=[5.0])
+            array([0.2, 0.3])
         """
-        mpc = self.mpc.redesigned(**changes)
-        self._law = replace(self._law, mpc=mpc)
-        u = np.clip(self.u, *mpc.design.u_bounds)
+        self._law = self._law.redesigned(**changes)
+        u = np.clip(self.u, *self.mpc.design.u_bounds)
         self._memory = self._memory._replace(u=u)
 
     def save(self, path: str | Path) -> None:

@@ -33,7 +33,7 @@ class Design:
         Q, R, dR: the weights, ``(n_y, n_y)`` and ``(m, m)`` twice.
         y_bounds, u_bounds, du_bounds: pairs (lower, upper), infinite where there is none.
         y_slack: the price of a unit of violation of ``y_bounds``, ``(n_y,)``; inf is hard, and
-            None becomes `price`.
+            NaN becomes `price`.
         linear: known signals, by index, or numbers that multiply inputs, by input.
         references: "held" or "preview".
         disturbances: B_w, C_w and names.
@@ -70,8 +70,8 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-        if self.y_slack is None:
-            object.__setattr__(self, "y_slack", self.price)
+        prices = np.where(np.isnan(self.y_slack), self.price, self.y_slack)
+        object.__setattr__(self, "y_slack", prices)
         if (self.y_slack < 0).any():
             got = f"{self.y_slack.tolist()}"
             raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
@@ -84,6 +84,30 @@ class Design:
         parts = [f"{y} by {u}", *([f"known {d}"] if d else []), f"horizon {self.horizon}"]
         parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
         return "; ".join(parts)
+
+    def merged(self, name: str, changes: Mapping[str, Any]) -> Any:
+        """Return an argument of `LinearMPC` as it is, but for the entries that ``changes`` names.
+
+        Weights of two signals stay with both; None removes a bound or all weights of a signal.
+        """
+        names = self.plant.outputs if name in ("Q", "y_bounds", "y_slack") else self.plant.inputs
+        if unknown := sorted({*changes} - {*names}):
+            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
+        old = getattr(self, name)
+        if name == "y_slack":
+            return dict(zip(names, old.tolist(), strict=True)) | changes
+        if name.endswith("_bounds"):
+            sides = [*zip(*(side.tolist() for side in old), strict=True)]
+            limited = {} if name == "du_bounds" else self.limits
+            limits = [limited.get(x, ("", "")) for x in names]
+            pairs = [[a or x, b or y] for (a, b), (x, y) in zip(limits, sides, strict=True)]
+            return dict(zip(names, pairs, strict=True)) | changes
+        weight = old.copy()
+        for i, value in ((names.index(x), value) for x, value in changes.items()):
+            if value is None:
+                weight[i] = weight[:, i] = 0.0
+            weight[i, i] = 0.0 if value is None else value
+        return weight
 
     @property
     def moves(self) -> bool:
@@ -373,6 +397,15 @@ def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:
     return weight
 
 
+def read_slack(value: Any, names: Sequence[str]) -> Array:
+    """Read prices of violations, NaN where None or no entry of a mapping asks for the default."""
+    if value is None or isinstance(value, Mapping):
+        value = {key: x for key, x in (value or {}).items() if x is not None}
+    prices = read_vector("y_slack", value, names, 0.0)
+    by_default = isinstance(value, Mapping) and [name not in value for name in names]
+    return np.where(by_default, np.nan, prices)
+
+
 def read_moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
     """Read bounds of moves, which must allow to hold an input."""
     lower, upper = read_bounds("du_bounds", du_bounds, names)
@@ -392,7 +425,7 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
     elif unknown := sorted({*value} - {*names}):
         raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
     else:
-        pairs = [value.get(x, (None, None)) for x in names]
+        pairs = [(None, None) if value.get(x) is None else value[x] for x in names]
         if not all(isinstance(x, Sequence) and len(x) == 2 for x in pairs):
             raise QPError.expected(name, repr(dict(value)), "pairs (lower, upper) by name")
         pair = [

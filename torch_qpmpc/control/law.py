@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
@@ -142,6 +142,20 @@ class Law:
     def renewed(self) -> Law:
         """Return the law with today's theta."""
         return replace(self)
+
+    def redesigned(self, **changes: Any) -> Law:
+        """Return the law with other settings; see `Controller.redesign`."""
+        names = {"noise": self.design.plant.outputs, "drift": self.design.disturbances.names}
+        wished = {name: changes.pop(name) for name in names if name in changes}
+        mpc = self.mpc.redesigned(**changes)
+        if not wished:
+            return replace(self, mpc=mpc)
+        settings = {name: getattr(self, name) for name in names} | wished
+        for name, value in wished.items():
+            if isinstance(value, Mapping):
+                old = zip(names[name], getattr(self, name).tolist(), strict=True)
+                settings[name] = dict(old) | value
+        return Law.of(mpc, **settings)
 
     def begun(self, u: Array | None = None, rests: bool = False) -> Memory:
         """Return a memory without a past, with the last input u, by default zero, in its bounds.
@@ -318,9 +332,12 @@ class Law:
 
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
-    """Read standard deviations, which must be positive."""
+    """Read standard deviations, which must be positive; None asks for the default."""
     if value is None:
         return default
+    if isinstance(value, Mapping):
+        named = {key: x for key, x in value.items() if x is not None}
+        value = dict(zip(names, default.tolist(), strict=True)) | named
     vector = read_vector(name, value, names, 0.0)
     if not ((vector > 0) & np.isfinite(vector)).all():
         got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))

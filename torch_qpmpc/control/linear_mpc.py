@@ -19,13 +19,14 @@ from torch_qpmpc.control.design import (
     read_limits,
     read_moves,
     read_prices,
+    read_slack,
     read_weight,
     signals_of,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import Affine, LinearScheme, free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
-from torch_qpmpc.control.state_space import StateSpace, read_model, read_vector
+from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.mpc.layout import read_blocks
@@ -140,7 +141,7 @@ class LinearMPC(Affine):
         check_whole("horizon", horizon, 1)
         weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
-        wishes = read_wishes(plant, {}, **weights, **bounds)
+        wishes = read_wishes(plant, None, **weights, **bounds)
         limits = wishes["y_bounds"], wishes["u_bounds"], wishes["Q"]
         scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
@@ -181,8 +182,8 @@ class LinearMPC(Affine):
         if self.learned:
             got, remedy = f"an MPC that learns {', '.join(self.learned)}", "Change its parameters."
             raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
-        plant, limits = self.design.plant, self.design.limits
-        design = replace(self.design, **read_wishes(plant, limits, **changes))
+        wishes = read_wishes(self.design.plant, self.design, **changes)
+        design = replace(self.design, **wishes)
         return LinearMPC(lowered(design), **{name: self.arguments[name] for name in KEYWORDS})
 
     def extra_repr(self) -> str:
@@ -314,10 +315,10 @@ class LinearMPC(Affine):
         )
 
 
-def read_wishes(
-    plant: StateSpace, limits: dict[str, tuple[str, str]], **wishes: Any
-) -> dict[str, Any]:
+def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[str, Any]:
     """Read weights and bounds by their arguments' names in `LinearMPC`, with new limits.
+
+    A mapping leaves what it does not name as the ``old`` design has it.
 
     Raises:
         QPError: one is invalid, or has another name.
@@ -327,14 +328,18 @@ def read_wishes(
         "Q": lambda name, value: read_weight(name, value, y),
         "R": lambda name, value: read_weight(name, value, u),
         "dR": lambda name, value: read_weight(name, value, u),
-        "y_slack": lambda name, value: None if value is None else read_vector(name, value, y, 0.0),
+        "y_slack": lambda _, value: read_slack(value, y),
         "y_bounds": lambda name, value: read_bounds(name, value, y),
         "u_bounds": lambda name, value: read_bounds(name, value, u),
         "du_bounds": lambda _, value: read_moves(value, u),
     }
     check_keywords("redesign", wishes, [*readers])
-    for name, names in {"y_bounds": y, "u_bounds": u}.items():
-        if name in wishes:
+    limits = {} if old is None else old.limits
+    for name, value in wishes.items():
+        if old is not None and isinstance(value, Mapping):
+            wishes[name] = old.merged(name, value)
+        if name in ("y_bounds", "u_bounds"):
+            names = y if name == "y_bounds" else u
             wishes[name], own = read_limits(name, wishes[name], names, plant)
             limits = {key: pair for key, pair in limits.items() if key not in names} | own
     return {name: readers[name](name, x) for name, x in wishes.items()} | {"limits": limits}

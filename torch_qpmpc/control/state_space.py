@@ -88,23 +88,26 @@ def read_model(
         model: (A, B) or (A, B, C_y) in discrete time, all states measured without C_y; a system
             with matrices A, B, C and D, such as control.StateSpace; or an `Identified`, whose names
             and dt are its log's.
-        E: the factor of known signals, ``(n, n_d)``.
-        dt: the sampling time; a continuous system is sampled with it, by zero-order hold.
+        E: the factor of known signals, ``(n, n_d)``, in the model's own time.
+        dt: the sampling time of a system; a continuous one is sampled with it, by zero-order hold.
         inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
             a system that are named in ``known`` become known signals. Those of an identification
             are all in ``known``; others there, such as a price, do not act on the plant.
         prices: known signals that act on no plant: what an identification says of them is noise.
 
     Raises:
-        QPError: the model is of another kind, has a direct feedthrough, or needs another dt; or a
-            known signal of an identification is missing in ``known``.
+        QPError: the model is of another kind, has a direct feedthrough, needs another dt, or has
+            an argument of its own; or a known signal of an identification is missing in ``known``.
     """
     if dt is not None:
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
     if isinstance(model, StateSpace):
+        own = {"E": E, "dt": dt, "inputs": inputs, "outputs": outputs, "known": known or None}
+        _check_absent("a StateSpace has its own", **own)
         return model
     offset, units, noise, states = None, {}, None, None
     if isinstance(model, Identified):
+        _check_absent("the identification has its own", E=E)
         A, B, E, offset, C, L, S, *_ = model.model
         noise, states = (L, S), visited(model.model, model.log.trajectories)
         log, dt = model.log, _own_dt(dt, model.log.dt)
@@ -117,10 +120,17 @@ def read_model(
         column = {x: E[:, i] for i, x in enumerate(log.known) if x not in prices}
         E = np.stack([column.get(x, np.zeros(len(A))) for x in known], -1) if known else E
     elif isinstance(model, Sequence) and len(model) in (2, 3):
+        if dt is not None:
+            remedy = (
+                "scipy.signal.lti(A, B, C, D) is sampled with dt; of matrices that are sampled "
+                "already, pass scipy.signal.dlti(A, B, C, D, dt=dt), without dt."
+            )
+            want = "None: they are those of one step, x+ = A x + B u"
+            raise QPError.expected("dt", f"{dt:g} with matrices", want, remedy)
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))
         C = rest[0] if rest else np.eye(len(A))
     else:
-        A, B, C, dt = _of_system(model, dt)
+        A, B, E, C, dt = _of_system(model, E, dt)
         inputs = inputs or _labels(model, "input_labels", B.shape[1])
         outputs = outputs or _labels(model, "output_labels", len(C))
         if inputs and E is None and known:
@@ -136,6 +146,13 @@ def read_model(
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
     return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states)
+
+
+def _check_absent(why: str, **arguments: Any) -> None:
+    """Raise `QPError` for an argument that a model leaves without a meaning."""
+    for name, value in arguments.items():
+        if value is not None:
+            raise QPError.expected(name, repr(value), f"None, as {why}")
 
 
 def read_row(name: str, value: Any, names: Sequence[str]) -> Array:
@@ -198,11 +215,11 @@ def read_table(
 
 
 def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
-    """Read one number for each name, from a number, a vector or a mapping."""
+    """Read one number for each name, from a number, a vector or a mapping; None is missing."""
     if isinstance(value, Mapping):
         if unknown := sorted({*value} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
-        value = [value.get(x, missing) for x in names]
+        value = [missing if value.get(x) is None else value[x] for x in names]
     vector = _numbers(name, value)
     vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
     if vector.shape != (len(names),) or np.isnan(vector).any():
@@ -231,8 +248,8 @@ def _labels(system: Any, name: str, size: int) -> list[str] | None:
     return list(labels) if labels is not None and len(labels) == size else None
 
 
-def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, float | None]:
-    """Return A, B, C and dt of a system, sampled if it is continuous."""
+def _of_system(system: Any, E: Any, dt: float | None) -> tuple[Any, ...]:
+    """Return A, B, E, C and dt of a system, sampled if it is continuous."""
     from scipy.signal import lti  # takes a second, which most controllers need not wait
 
     if not hasattr(system, "A") and hasattr(system, "to_ss"):
@@ -250,14 +267,15 @@ def _of_system(system: Any, dt: float | None) -> tuple[Array, Array, Array, floa
             remedy = "It is sampled with that, by zero-order hold."
             raise QPError.expected("dt", "None for a continuous model", "a sampling time", remedy)
         n, m = B.shape
-        hold = scipy.linalg.expm(dt * np.pad(np.hstack((A, B)), ((0, m), (0, 0))))
-        return hold[:n, :n], hold[:n, n:], C, dt
+        driven = np.hstack((A, B) if E is None else (A, B, _matrix("E", E)))
+        hold = scipy.linalg.expm(dt * np.pad(driven, ((0, driven.shape[1] - n), (0, 0))))[:n]
+        return hold[:, :n], hold[:, n : n + m], None if E is None else hold[:, n + m :], C, dt
     if own is None:
         remedy = "Set model.dt: 0 if it is continuous, True or a number if it is discrete."
         raise QPError.expected("model", "no time base", "a continuous or discrete model", remedy)
     if own is True:
-        return A, B, C, dt
-    return A, B, C, _own_dt(dt, float(own))
+        return A, B, E, C, dt
+    return A, B, E, C, _own_dt(dt, float(own))
 
 
 def _own_dt(dt: float | None, own: float | None) -> float | None:
