@@ -95,8 +95,36 @@ def test_it_is_evaluated_if_it_is_chosen(chosen, there):
     assert (IDENTIFICATION in found.rivals) == there
     if there:
         assert found.rivals[IDENTIFICATION] < 0.8 * found.loops["start"].J
+        assert not found.missing
         found.identify(lambda: [log[:2, :1]])
         assert math.isnan(found.rivals[IDENTIFICATION])
+        assert "trajectories: got 2 transitions" in found.missing["rival identification"]
+
+
+PENDULUM = ("task=gymnasium", "task.id=Pendulum-v1", *DATA, "constraint=free", "num_envs=2")
+
+
+@pytest.mark.parametrize("order", [0, 3], ids=["outputs", "estimates"])
+@pytest.mark.filterwarnings("ignore:The fitted stage cost")
+def test_logs_of_any_kind_have_a_rival_or_a_reason(order):
+    """Of estimates and of outputs, of few rows, and without an episode's end."""
+    cfg = make_config(*PENDULUM, "rivals=[identification]", "task.eval_steps=5")
+    physics = make_physics(cfg)
+    log = collect_log(cfg, physics)
+    start = identified_start(cfg, physics, log, order)
+    assert ("next", "measured") in start.log.keys(True)
+    found = Evaluation(cfg, start.plant(physics), {}, {})
+    flags = [("next", name) for name in ("done", "terminated", "truncated")]
+    for rows in range(4):
+        few = start.log[:, :rows].exclude(("next", "measured"))
+        for data in ([few], [start.log, few], [few, start.log.exclude(*flags)]):
+            found.missing.clear()
+            found.identify(lambda data=data: data)
+            reason = found.missing.get("rival identification", "trajectories: got 0")
+            assert reason.startswith("trajectories: got "), reason
+            missing = len(data) == 1 and few.numel() <= start.layout.n_x + 2
+            assert bool(found.missing) == missing
+            assert math.isfinite(found.rivals[IDENTIFICATION]) != missing
 
 
 @pytest.mark.parametrize("costs", [[2.0, 1.0], [1.0, 2.0], [math.nan, 1.0]])

@@ -23,6 +23,8 @@ from tests.runs import CONFIGS, SMALL, make_config, run_command
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass
+from torch_qpmpc.experiment import evaluation
+from torch_qpmpc.experiment import metrics as metrics_of_runs
 from torch_qpmpc.experiment.launch import LOCK, locked
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.files import load_file
@@ -127,6 +129,22 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     assert (table[[f"theta/{name}" for name in moved]].dropna().std() > 0).all()
     hard = table[["theta/lb_2", "theta/ub_2"]].dropna()
     assert (hard == [-1.0, 1.0]).all(axis=None)
+
+
+def test_what_the_end_cannot_show_is_said(tmp_path, monkeypatch, capsys):
+    """A rival or a figure that fails costs no run."""
+
+    def failing(*_: object) -> None:
+        raise RuntimeError("no canvas\nfor a figure")
+
+    monkeypatch.setattr(metrics_of_runs, "summary_figure", failing)
+    monkeypatch.setattr(evaluation, "nominal_mpcs", failing)
+    summary = run_small(tmp_path, "figures=true", "rivals=[identification]")
+    reason = "RuntimeError: no canvas"
+    assert summary["missing"] == {"rival identification": reason, "summary.png": reason}
+    assert json.loads((tmp_path / "summary.json").read_text())["missing"] == summary["missing"]
+    assert (tmp_path / "episode.png").exists()
+    assert f"\nThe run has no summary.png: {reason}\n" in capsys.readouterr().out
 
 
 def test_a_seed_determines_every_number(tmp_path):

@@ -80,6 +80,31 @@ def test_rewards_that_are_missing_or_not_finite_are_named():
         fit_rewards(data.exclude(("next", "reward")), LAYOUT)
 
 
+@pytest.mark.filterwarnings("ignore:The fitted stage cost explains")
+def test_logs_that_differ_in_what_they_measured_are_fitted_together():
+    """The outputs of estimates count where every log has those of the model."""
+    zero, C = torch.zeros(2, 0), torch.eye(2)
+    parts = (0.5 * C, torch.ones(2, 1), zero, C[0], C, C, C, 0 * C[0], C)
+    model = Innovations(*(part.double().numpy() for part in parts))
+    data, outputs = log(), torch.zeros(1, 300, 1).double()
+    plain = fit_rewards([data, data], LAYOUT, model=model)
+    for own in (data["next", "observation"], outputs):
+        estimates = data.clone().set(("next", "measured"), own)
+        for mixed in ([estimates, data], [data, estimates]):
+            assert torch.equal(fit_rewards(mixed, LAYOUT, model=model).W, plain.W)
+
+
+@pytest.mark.filterwarnings("ignore:The fitted stage cost has too few rewards")
+@pytest.mark.parametrize("rows", range(4))
+def test_a_log_of_few_rows_has_a_cost_or_says_why_not(rows):
+    data = log()[:, :rows]
+    if rows:
+        assert fit_rewards([data, data[:, :0]], LAYOUT).W.isfinite().all()
+    else:
+        with pytest.raises(QPError, match="stage_weight: got none, and a log without steps"):
+            fit_rewards([data, data], LAYOUT)
+
+
 @pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
 def test_the_cost_of_a_plan_is_the_sum_of_its_stages(hessian):
     """x_N has the stage's cost, without an action."""

@@ -6,8 +6,9 @@ All have the same starts and disturbances. All but the learned policy are evalua
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
-from torch_qpmpc.errors import QPError
+from torch_qpmpc.errors import QPError, printable
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, Policy
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
@@ -71,12 +72,14 @@ class Evaluation:
         loops: those of ``start``, ``learned``, which is kept, and, if they are there, of the last
             ``candidate`` and the ``true model``.
         rivals: J of the task's rivals by name, after `identify` also of `IDENTIFICATION`.
+        missing: why the end of the run lacks a rival or a figure, by name.
     """
 
     cfg: DictConfig
     physics: AnyPlant
     loops: dict[str, ClosedLoop]
     rivals: dict[str, float]
+    missing: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def before(
@@ -111,14 +114,20 @@ class Evaluation:
         chosen = self.cfg.rivals
         if not (chosen if isinstance(chosen, bool) else IDENTIFICATION in chosen):
             return
-        try:
-            mpcs = nominal_mpcs(self.cfg, self.physics, data())
-        except QPError:
-            self.rivals[IDENTIFICATION] = math.nan
-        else:
-            policies = map(warm_policy, mpcs)
+        self.rivals[IDENTIFICATION] = math.nan
+        with self.optional(f"rival {IDENTIFICATION}"):
+            policies = map(warm_policy, nominal_mpcs(self.cfg, self.physics, data()))
             costs = (evaluate(self.cfg, policy, self.physics).J for policy in policies)
             self.rivals[IDENTIFICATION] = min(costs, key=lambda J: (math.isnan(J), J))
+
+    @contextmanager
+    def optional(self, name: str) -> Iterator[None]:
+        """Go on without what a block makes for the end of a run, ``name``, and keep the reason."""
+        try:
+            yield
+        except Exception as error:  # of any type: hours of learning do not end with a figure
+            kind = "" if isinstance(error, QPError) else f"{type(error).__name__}: "
+            self.missing[name] = printable(kind + str(error).strip().partition("\n")[0])
 
     def lines(self) -> dict[str, float]:
         """Return J of the start, the true model and the rivals by name."""

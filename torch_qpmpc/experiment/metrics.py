@@ -124,6 +124,7 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     physics = evaluation.physics
     if raised := getattr(physics, "raised", None):
         summary |= {"raised": len(raised), "first_raised": raised[0]}
+    summary |= {"missing": dict(evaluation.missing)} if evaluation.missing else {}
     return summary | {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
 
 
@@ -143,10 +144,12 @@ def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> d
 
 def draw_outcome(run: RunFolder, mpc: QPMPC, evaluation: Evaluation) -> None:
     """Draw summary.png and episode.png."""
-    summary = summary_figure(mpc, evaluation, *run.column("eval/J"))
-    summary.savefig(run.path / "summary.png", dpi=110)
+    with evaluation.optional("summary.png"):
+        summary = summary_figure(mpc, evaluation, *run.column("eval/J"))
+        summary.savefig(run.path / "summary.png", dpi=110)
     if evaluation.loops["learned"].known.isfinite().all():
-        learned_episode_figure(mpc, evaluation).savefig(run.path / "episode.png", dpi=110)
+        with evaluation.optional("episode.png"):
+            learned_episode_figure(mpc, evaluation).savefig(run.path / "episode.png", dpi=110)
 
 
 def theta_metrics(mpc: QPMPC) -> dict[str, float]:
@@ -178,6 +181,8 @@ def table(summary: Mapping[str, Any]) -> str:
         kept += f", the last one of which costs {cost_text(summary['J_final'])}"
         compared = next(f"{summary[x]:,} {x}" for x in COMPARED if x in summary)
         lines += ["", f"The gate kept the start: {kept}, by at most {compared} transitions."]
+    if missing := summary.get("missing"):
+        lines += ["", *(f"The run has no {name}: {why}" for name, why in missing.items())]
     if raised := summary.get("raised"):
         lines += ["", f"The plant ended {raised} episodes by exceptions: {summary['first_raised']}"]
     return "\n".join(lines)

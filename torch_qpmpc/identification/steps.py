@@ -67,7 +67,7 @@ def _of_rows(data: Any, n_x: int | None, n_d: int) -> list[Trajectory]:
     for row in range(len(y)):
         start = 0
         for stop in (*(ends[row, :-1].nonzero().flatten() + 1).tolist(), y.shape[1]):
-            if valid[row, start:stop].all():
+            if stop > start and valid[row, start:stop].all():
                 outputs = torch.cat((y[row, start:stop], following[row, stop - 1 : stop]))
                 trajectories.append(Trajectory(outputs, u[row, start:stop], d[row, start:stop]))
             start = stop

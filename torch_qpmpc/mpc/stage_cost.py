@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -249,17 +250,23 @@ def fit_rewards(
     """Fit the stage cost of (d_k, x_k, u_k) to the rewards of a log, as `fit_stage_cost`.
 
     Many plants reward the next state or its outputs. With a ``model`` costs of (x_{k+1}, u_k) and,
-    of estimates, (y_{k+1}, u_k) are fitted, too: one that leaves less than half of the variance
-    unexplained is returned as the cost of (x_k, u_k) that the model makes of it, but not for a
-    ``diagonal`` W or with known signals. An R2 below 0.9 is warned of.
+    where each log has the outputs of its estimates, (y_{k+1}, u_k) are fitted, too: one that leaves
+    less than half of the variance unexplained is returned as the cost of (x_k, u_k) that the model
+    makes of it, but not for a ``diagonal`` W or with known signals. An R2 below 0.9 is warned of.
+
+    Raises:
+        QPError: a log lacks finite rewards, or there is no step.
     """
-    parts = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    x, u, following, measured, cost = map(torch.cat, parts)
+    *parts, measured = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
+    x, u, following, cost = map(torch.cat, parts)
+    if not len(cost):
+        raise _unfitted("a log without steps")
     fitted = fit_stage_cost(torch.cat((x, u), -1), cost, layout.n_d, diagonal)
     if model is not None and not diagonal and not layout.n_d:
         L, S, C = map(torch.tensor, (model.L, model.S, model.C))
         nexts = [(following, torch.eye(layout.n_x).to(C), L @ S @ L.mT)]
-        nexts += [(measured, C, S)] if measured.shape[1] else []
+        if {outputs.shape[1] for outputs in measured} == {len(C)}:
+            nexts.append((torch.cat(measured), C, S))
         for following, C, noise in nexts:
             after = fit_stage_cost(torch.cat((following, u), -1), cost)
             if 1 - after.R2 < LEFT * (1 - fitted.R2):
@@ -271,8 +278,8 @@ def fit_rewards(
 
 def missed(log: Any, layout: Layout) -> float:
     """Return the share of the costs' variance that is left by one of any sign in (d_k, x_k)."""
-    parts = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    x, u, *_, cost = map(torch.cat, parts)
+    x, u, _, cost, _ = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
+    x, u, cost = map(torch.cat, (x, u, cost))
     return 1 - fit_stage_cost(torch.cat((x, u), -1), cost, x.shape[1]).R2
 
 
@@ -303,7 +310,7 @@ def scheme_cost(fitted: StageCost, layout: Layout, gamma: float, hessian: str) -
 
 
 def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
-    """Return [d; x], u, the next x, the next y of estimates, and the costs, without padding."""
+    """Return [d; x], u, the next x, the costs, and the next y of estimates, without padding."""
     reward = steps.get(("next", "reward"), None) if hasattr(steps, "batch_size") else None
     if reward is None:
         raise _unfitted("a log without rewards")
@@ -317,14 +324,16 @@ def _observed(steps: Any, layout: Layout) -> tuple[Tensor, ...]:
     measured = steps.get(MEASURED, u[..., :0])
     parts = (d, x, u, following, measured)
     d, x, u, following, measured = (part.detach().cpu().double()[kept] for part in parts)
-    return torch.cat((d, x), -1), u, following, measured, -reward
+    return torch.cat((d, x), -1), u, following, -reward, measured
 
 
 def poor(R2: float) -> str:
     """Say that a fitted cost explains the rewards poorly."""
+    fit = f"explains {R2:.1%} of the rewards' variance"
+    fit = "has too few rewards to judge it by" if math.isnan(R2) else fit
     return (
-        f"The fitted stage cost explains {R2:.1%} of the rewards' variance: the controller "
-        "minimises another cost than the plant's. Pass the plant's own cost as stage_weight (a "
+        f"The fitted stage cost {fit}: the controller "
+        "may minimise another cost than the plant's. Pass the plant's own cost as stage_weight (a "
         "matrix with hessian='block'), in train.py task.stage_weight, or a log about the states "
         "where the controller is to work."
     )

@@ -20,7 +20,7 @@ from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
 from torch_qpmpc.identification.identification import Identified, check_excitation, measured_model
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.reading import as_log
-from torch_qpmpc.identification.steps import valid_steps
+from torch_qpmpc.identification.steps import MEASURED, valid_steps
 from torch_qpmpc.identification.subspace import fit_state_space
 from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
@@ -239,6 +239,7 @@ def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBa
     task = find_task(cfg.task)
     scheme = (task.nominal_scheme or task.true_scheme or task.wrong_scheme)(cfg, physics)
     layout, costs = scheme.layout, [scheme.cost]
+    data = [steps.exclude(MEASURED) for steps in data]  # its outputs are the observations
     model, _ = measured_model(data, layout.n_x, layout.n_d)
     if scheme.cost.stage_weight is None:
         diagonal = cfg.task.hessian == "diagonal"
