@@ -97,10 +97,7 @@ def _train(
 
     # The learner: Q-learning of first or second order.
     operator = make_operator(mpc)
-    plant = None
-    if identified is not None and cfg.optimizer.name == "closed_loop":
-        plant = identified.simulated(cfg, physics, start.scheme)
-    learner = make_learner(cfg, operator, plant)
+    learner = make_learner(cfg, operator)
     replay = make_run_replay(cfg, mpc)
     gate = RunGate(cfg, learner, physics)
     if state is None and mpc is not start:

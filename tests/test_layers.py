@@ -33,7 +33,7 @@ BUDGET = {
     "analysis": 851,
     "control": 4500,
     "envs": 1394,
-    "experiment": 3123,
+    "experiment": 3075,
     "export": 1450,
     "learning": 2900,
     "identification": 1800,

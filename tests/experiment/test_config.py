@@ -66,7 +66,6 @@ class Recorder:
 
 
 DATA = ("start=data", "task=pendulum", "start.transitions=40", "constraint=free")
-LOOPS = ("optimizer=closed_loop", "optimizer.loops=2", "optimizer.steps=2", "optimizer.members=1")
 
 
 def test_each_key_is_read(tmp_path, monkeypatch):
@@ -78,7 +77,6 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         "first": ("gate=true", "optimizer=adam"),
         "second": ("gate=true", "constraint=combined", "optimizer=gauss_newton"),
         "data": (*DATA, "+task.start_episodes=2"),
-        "loops": (*DATA, *LOOPS),
     }.items():
         cfg = make_config(
             *SMALL, "updates=2", "task.eval_steps=2", "task.episode_steps=4", *overrides
@@ -185,10 +183,6 @@ def test_missing_keys(key):
         ("constraint=si constraint.structure=varying", "got 'varying', expected free. gauss_new"),
         ("constraint=mpc constraint.learn=[C,G]", r"got \['C', 'G'\], expected no G. No task has"),
         ("task.terminal_weight=riccati", "got 'riccati', expected default or identity. The Ricc"),
-        (
-            "optimizer=closed_loop",
-            "optimizer.name: got 'closed_loop', expected another .* add start",
-        ),
         ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
         ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),
         ("rivals=[nobody]", r"rivals: got \['nobody'\], expected .* identification. They are the"),

@@ -31,7 +31,6 @@ RUN = (
 )
 STOP = 5
 SECOND = "optimizer=gauss_newton"
-LOOPS = ("optimizer=closed_loop", "optimizer.loops=2", "optimizer.steps=6", "optimizer.members=2")
 DATA = ("start=data", "start.transitions=200", "constraint=free")
 
 
@@ -42,7 +41,7 @@ DATA = ("start=data", "start.transitions=200", "constraint=free")
         ("optimizer=adam", "constraint=mpc", "solver=torch", "step=projection"),
         (SECOND, "constraint=free", "replay=false", "noise=brownian", "steps_per_update=3"),
         (SECOND, "gate=plant", "constraint=mpc", "solver=proxqp"),
-        (*LOOPS, "gate=true", *DATA),
+        (SECOND, "gate=true", *DATA),
         (SECOND, "task=store", "constraint=combined", "replay_capacity=40"),
     ],
     ids=" ".join,

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -20,7 +19,6 @@ from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task
 from torch_qpmpc.identification.steps import valid_steps
-from torch_qpmpc.learning.closed_loop import Descent, SimulatedPlant
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
@@ -31,7 +29,7 @@ from torch_qpmpc.learning.operators import (
 from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
-from torch_qpmpc.learning.updates import Update, entries_of_C, first_order, second_order
+from torch_qpmpc.learning.updates import Update, first_order, second_order
 from torch_qpmpc.mpc.module import QPMPC
 
 
@@ -75,29 +73,18 @@ def make_operator(mpc: QPMPC) -> QPActorValueOperator:
     return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=ACTIVE_SET)
 
 
-def make_learner(
-    cfg: DictConfig,
-    operator: QPActorValueOperator,
-    plant: SimulatedPlant | None = None,
-) -> Learner:
-    """Make the learner; ``plant`` is the identified one, for ``optimizer=closed_loop``."""
+def make_learner(cfg: DictConfig, operator: QPActorValueOperator) -> Learner:
+    """Make the learner of the operator's QP."""
     mpc = operator.module
     loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip, weighted=cfg.weighted)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     penalties = make_penalties(cfg, mpc)
-    if plant is not None:
-        options = cfg.optimizer
-        descent = Descent(mpc, plant, options.loops, options.steps, options.lr)
-        optimizer = descent.optimizer
-        scheduler = make_scheduler(cfg, optimizer)
-        update = closed_loop_update(mpc, descent, scheduler, cfg.seed, *penalties)
+    optimizer = make_optimizer(cfg, mpc)
+    scheduler = make_scheduler(cfg, optimizer)
+    if isinstance(optimizer, GaussNewton):
+        update = second_order(mpc, loss_module, optimizer, *penalties)
     else:
-        optimizer = make_optimizer(cfg, mpc)
-        scheduler = make_scheduler(cfg, optimizer)
-        if isinstance(optimizer, GaussNewton):
-            update = second_order(mpc, loss_module, optimizer, *penalties)
-        else:
-            update = first_order(mpc, loss_module, optimizer, *penalties)
+        update = first_order(mpc, loss_module, optimizer, *penalties)
     return Learner(
         update,
         loss_module,
@@ -107,34 +94,6 @@ def make_learner(
         *penalties,
         n_preview=(mpc.horizon + 1) * mpc.n_d,
     )
-
-
-def closed_loop_update(
-    mpc: QPMPC,
-    descent: Descent,
-    scheduler: LambdaLR,
-    seed: int,
-    deviation: DeviationPenalty | None,
-    si: SystemIdentificationPenalty | None,
-) -> Update:
-    """Return an update by the gradient of closed loops, with new loops in each update."""
-
-    def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Any]:
-        entropy = np.random.SeedSequence([seed, scheduler.last_epoch])
-        descent.start(int(entropy.generate_state(1)[0]))
-
-        def penalty(mpc: QPMPC) -> Tensor:
-            if si is None or windows is None:
-                return torch.zeros(())
-            return si(mpc.C, windows, mpc.b.detach())
-
-        cost = descent.update(penalty)
-        if deviation is not None:
-            share = float(scheduler.get_last_lr()[0] / scheduler.base_lrs[0])
-            deviation.proximal_step_(entries_of_C(mpc), share)
-        return {"loss/closed_loop": cost}, {}
-
-    return update
 
 
 def make_penalties(

@@ -84,15 +84,6 @@ class GaussNewton(Group):
     final_fraction: Fraction
 
 
-class ClosedLoop(Group):
-    name: Literal["closed_loop"]
-    lr: Positive
-    loops: Count
-    steps: Count
-    members: Count
-    final_fraction: Fraction
-
-
 class FromModel(Group):
     """Learning starts from the model of the task."""
 
@@ -158,7 +149,7 @@ class Config(Group):
     task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
     noise: Noise
     constraint: Constraint
-    optimizer: Annotated[Adam | SGD | GaussNewton | ClosedLoop, Field(discriminator="name")]
+    optimizer: Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
 
     def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
         """Raise the error of a value that conflicts with others."""
@@ -181,9 +172,6 @@ class Config(Group):
             self.conflict("constraint.structure", "free", remedy)
         if tied and "G" in part.learn:
             self.conflict("constraint.learn", "no G", "No task has mixed constraints to learn.")
-        if self.optimizer.name == "closed_loop" and self.start.name != "data":
-            remedy = "closed_loop needs the model of a log: add start=data."
-            self.conflict("optimizer.name", "another one with start=model", remedy)
         if self.replay_capacity % self.num_envs:
             self.conflict("replay_capacity", f"a multiple of num_envs = {self.num_envs}")
         if part.si and (self.task.episode_steps or self.task.horizon) < self.task.horizon:

@@ -69,14 +69,12 @@ class Fit(NamedTuple):
         model: the model.
         order, lags: as in `fit_state_space`.
         candidates: those that were compared.
-        pole: the model is `Innovations.remembering` with it.
     """
 
     model: Innovations
     order: int
     lags: int
     candidates: tuple[Candidate, ...] = ()
-    pole: float | None = None
 
 
 class Signals(NamedTuple):

@@ -199,7 +199,7 @@ def ensemble(identified: Identified, members: int, seed: int) -> list[Innovation
     rng, models = np.random.default_rng(seed), [fit.model]
     for _ in range(members - 1 if len(log) > 1 else 0):
         again = [log[i] for i in rng.integers(len(log), size=len(log))]
-        models.append(fit_state_space(again, fit.order, fit.lags).model.remembering(fit.pole))
+        models.append(fit_state_space(again, fit.order, fit.lags).model)
     return models
 
 

@@ -17,12 +17,11 @@ from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
-from torch_qpmpc.identification.identification import Identified, check_excitation, measured_model
+from torch_qpmpc.identification.identification import check_excitation, measured_model
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.identification.steps import MEASURED, valid_steps
 from torch_qpmpc.identification.subspace import fit_state_space
-from torch_qpmpc.learning.closed_loop import SimulatedPlant, simulated_plant, stage_cost
 from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
@@ -53,8 +52,7 @@ class Start(NamedTuple):
     estimate by its filter; ``order`` is as in `fit_state_space`. ``cut`` is the number of the log's
     episodes that blow up. ``action`` ``(n_u,)`` is what the policy holds, by a cost of its
     own. ``choice`` is the table of starts that it was chosen from, ``blended`` the QP's schedule.
-    ``riccati`` is True if the cost of x_N is the regulator's. ``found`` is the identified model
-    with the outputs of the log.
+    ``riccati`` is True if the cost of x_N is the regulator's.
     """
 
     log: Any
@@ -68,14 +66,6 @@ class Start(NamedTuple):
     choice: Choice | None = None
     blended: BlendedModel | None = None
     riccati: bool = False
-    found: Identified | None = None
-
-    def simulated(self, cfg: DictConfig, physics: AnyPlant, scheme: Scheme) -> SimulatedPlant:
-        """Return the plant of the models of the log, with the task's own cost if it is known."""
-        assert self.found is not None
-        known = isinstance(physics, LinearSystem)
-        cost = physics.cost if known else stage_cost(scheme)
-        return simulated_plant(self.found, cost, self.horizon, cfg.optimizer.members, cfg.seed)
 
     @property
     def observer(self) -> Innovations | None:
@@ -136,10 +126,9 @@ def identified_start(
     check_excitation(data)
 
     def start(pole: float | None = None) -> Start:
-        own = fit._replace(model=fit.model.remembering(pole), pole=pole)
-        found = Identified(own.model, data, cfg.task.horizon, own)
-        steps = estimated(log, own.model) if observed else log
-        return Start(steps, own.model, found.horizon, fit.order, observed, cut=cut, found=found)
+        model = fit.model.remembering(pole)
+        steps = estimated(log, model) if observed else log
+        return Start(steps, model, cfg.task.horizon, fit.order, observed, cut=cut)
 
     def left(start: Start) -> float:
         return missed(start.log, start.layout)
