@@ -95,13 +95,13 @@ class Design:
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         old = getattr(self, name)
         if name == "y_slack":
-            return dict(zip(names, old.tolist(), strict=True)) | changes
+            return {**dict(zip(names, old.tolist(), strict=True)), **changes}
         if name.endswith("_bounds"):
             sides = [*zip(*(side.tolist() for side in old), strict=True)]
             limited = {} if name == "du_bounds" else self.limits
             limits = [limited.get(x, ("", "")) for x in names]
             pairs = [[a or x, b or y] for (a, b), (x, y) in zip(limits, sides, strict=True)]
-            return dict(zip(names, pairs, strict=True)) | changes
+            return {**dict(zip(names, pairs, strict=True)), **changes}
         weight = old.copy()
         for i, value in ((names.index(x), value) for x, value in changes.items()):
             if value is None:

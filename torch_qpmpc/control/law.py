@@ -154,7 +154,7 @@ class Law:
         for name, value in wished.items():
             if isinstance(value, Mapping):
                 old = zip(names[name], getattr(self, name).tolist(), strict=True)
-                settings[name] = dict(old) | value
+                settings[name] = {**dict(old), **value}
         return Law.of(mpc, **settings)
 
     def begun(self, u: Array | None = None, rests: bool = False) -> Memory:
