@@ -1,0 +1,256 @@
+"""Every documented command runs to its end: shortened, and with another seed than the page's.
+
+`SHORT` names each line ``python ..`` and ``bash ..`` of README, docs and notebooks, and what
+shortens it; a command without an entry fails. ``pytest -m slow -s tests/test_commands.py`` runs
+them, page by page in a copy of the repository, and prints their times; those of train.py alone are
+quick in one process.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tests.pages import PAGES, ROOT, fenced, needs_docs
+from tests.runs import SMALL, run_command
+
+pytestmark = needs_docs
+
+#: Another seed, few updates, and short closed loops.
+FEW = "seed=71 updates=2 eval_interval=2 task.eval_steps=3"
+DATA = f"{FEW} start.transitions=200 task.start_episodes=2"
+SWEEP = f"{FEW} hydra.launcher.n_jobs=2 hydra.launcher.verbose=0"
+CASE = f"{SWEEP} constraint=fixed noise=gaussian"
+#: A run that is stopped at its first checkpoint.
+STOPPED = (
+    "python train.py {run} & while [ ! -e {folder}/checkpoint.pt ]; do sleep 0.2; done; kill $!; "
+    "wait $! && exit 1; "
+)
+LONG = " ".join(SMALL) + " seed=71 updates=200 hydra.run.dir={folder}"
+PENDULUM = "python train.py task=gymnasium task.id=Pendulum-v1 start=data"
+SCRIPT = "import runpy; print(runpy.run_path('docs/examples/torchrl/ddpg.py')['main'](2, seed=71))"
+
+
+class Short(NamedTuple):
+    """How a command is shortened.
+
+    ``more`` is added to it, or the shell's command ``instead`` takes its place; ``files`` maps
+    places that it reads to blocks of Python of its page. ``needs`` are modules that may be missing.
+    """
+
+    more: str = ""
+    instead: str = ""
+    needs: tuple[str, ...] = ()
+    quick: bool = False
+    files: tuple[tuple[str, str], ...] = ()
+
+
+#: Why a command does not run in these tests.
+CANNOT = {
+    "python3 -m venv .venv": "it makes an environment; .ci/run does, too",
+    "python -m tests.benchmarks.table": "a benchmark of minutes that cannot be shortened",
+    "python -m tests.benchmarks.one_state --write": "the same, with osqp, clarabel and casadi",
+    "python -m tests.benchmarks.solvers --write": "the same, with piqp, osqp, qpax and more",
+    "python -m tests.benchmarks.export --write": "the same, with osqp",
+    "python -m tests.benchmarks.gpu --write": "it needs a GPU",
+    "python -m tests.benchmarks.daisy FOLDER --write": "its data sets are downloaded by hand",
+    "python train.py -m +study=paper hydra/launcher=submitit_slurm "
+    "hydra.launcher.partition=PARTITION hydra.launcher.timeout_min=60 "
+    "hydra.launcher.cpus_per_task=1 hydra.launcher.array_parallelism=40": "it needs Slurm",
+}
+MY_TASK = (("my_task.py", "register("),)
+SHORT = {
+    # train.py: one run.
+    "python train.py": Short(FEW, quick=True),
+    "python train.py solver=daqp": Short(FEW, quick=True),
+    "python train.py constraint=free noise=brownian seed=2": Short(FEW, quick=True),
+    "python train.py constraint=deviation": Short(FEW, quick=True),
+    "python train.py constraint=si": Short(FEW, quick=True),
+    "python train.py constraint=combined": Short(FEW, quick=True),
+    "python train.py constraint=identified": Short(FEW, quick=True),
+    "python train.py constraint=deviation constraint.deviation.c_2=1e-3": Short(FEW, quick=True),
+    "python train.py +study=paper constraint=deviation noise=brownian": Short(FEW, quick=True),
+    "python train.py task=gros_zanon solver=daqp": Short(FEW, quick=True),
+    "python train.py task=pendulum gate=plant": Short(FEW, quick=True),
+    "python train.py task.file=docs/examples/house.py": Short(FEW, quick=True),
+    PENDULUM: Short(DATA, quick=True),
+    f"{PENDULUM} hydra.run.dir=runs/mine": Short(DATA),
+    "python train.py task=gymnasium task.id=InvertedPendulum-v5 start=data": Short(
+        DATA, needs=("mujoco",)
+    ),
+    "python train.py start=data start.file=FOLDER/log.pt": Short(
+        instead=f"python train.py start=data start.transitions=200 {FEW} hydra.run.dir=FOLDER && "
+        f"python train.py start=data start.file=FOLDER/log.pt {FEW}"
+    ),
+    "python train.py hydra.run.dir=runs/mine": Short(FEW),
+    "python train.py resume=runs/mine": Short(
+        instead="rm -r runs/mine; "
+        + STOPPED.format(folder="runs/mine", run=LONG.format(folder="runs/mine"))
+        + "python train.py resume=runs/mine"
+    ),
+    # Sweeps, and the tables of their folders.
+    "python train.py -m constraint=fixed,free seed=1,2": Short(SWEEP),
+    "python train.py -m constraint=fixed,free seed=1,2,3": Short(SWEEP),
+    "python train.py -m +study=paper": Short(CASE),
+    "python train.py -m +study=ablations": Short(f"{SWEEP} +ablation=reference"),
+    "python train.py -m +study=frontier": Short(
+        f"{SWEEP} constraint.si.beta=0 constraint.deviation='{{c_1: 1, c_2: 0, c_3: 0}}'"
+    ),
+    "python train.py -m task.file=docs/examples/short_horizon.py weighted=true eval_seed=777 "
+    "seed=range(111,121)": Short(SWEEP),
+    "python -m torch_qpmpc.report runs/study-paper": Short("runs/study-paper"),
+    "python -m torch_qpmpc.report runs/study-paper --page docs/results/paper.md": Short(
+        "runs/study-paper --page docs/results/paper.md"
+    ),
+    "python -m torch_qpmpc.report runs/study-frontier": Short("runs/study-frontier"),
+    # A script of one's own.
+    "python train.py task.file=my_task.py solver=daqp hydra.run.dir=pole": Short(
+        FEW, files=MY_TASK
+    ),
+    "python my_task.py -m task=pole solver=daqp seed=1,2,3": Short(SWEEP, files=MY_TASK),
+    "python train.py resume=FOLDER task.file=my_task.py": Short(
+        instead=STOPPED.format(
+            folder="FOLDER", run="task.file=my_task.py " + LONG.format(folder="FOLDER")
+        )
+        + "python train.py resume=FOLDER task.file=my_task.py",
+        files=MY_TASK,
+    ),
+    "python docs/examples/torchrl/ddpg.py": Short(instead=f'python -c "{SCRIPT}"'),
+    # Benchmarks that can be shortened: one row of each.
+    "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
+    "python -m tests.benchmarks.closed_loops --cases Gros-Zanon 'Heated tank, after learn' "
+    "--seeds 6 7 8 9 10": Short("--cases Gros-Zanon --seeds 71"),
+    "python -m tests.benchmarks.closed_loops --cases 'controlgym he2' --seeds 7 8 9 10 11": Short(
+        "--seeds 71", needs=("controlgym",)
+    ),
+    "python -m tests.benchmarks.improvement": Short(
+        "--cases 'Point mass, Brownian noise' --seeds 71"
+    ),
+    "python -m tests.benchmarks.outside --seeds 16 17 18 19 20": Short(
+        "--plants psm --seeds 71", needs=("controlgym",)
+    ),
+    "python -m tests.benchmarks.guide --seeds 16 17 18 19 20 --write": Short(
+        "--seeds 71", needs=("controlgym",)
+    ),
+    # The campaigns.
+    "python -m tests.campaign --count 100000 --solver daqp": Short(
+        "--count 40 --seed 71 --results counts"
+    ),
+    "python -m tests.campaign --solver 'daqp, warm'": Short(
+        "--count 40 --seed 71 --results counts"
+    ),
+    "python -m tests.campaign --solver --write": Short(),
+    "python -m tests.campaign --count 100000 --solver NAME": Short(
+        "--count 40 --seed 71 --solver torch --results counts"
+    ),
+    "python -m tests.campaign.numerics --write": Short("--solver daqp"),
+    "python -m tests.campaign.numerics --solver NAME": Short("--solver daqp"),
+    "python -m tests.campaign.rounding": Short("--count 40 --controllers 1 --seed 71"),
+    "python -m tests.campaign.export --count 100000 --write": Short("--count 20"),
+    "python -m tests.campaign.units --compiled 200": Short("--count 2 --compiled 1 --first 71"),
+    "python -m tests.campaign.soak": Short("--steps 500"),
+    "python -m tests.faults.kill --count 20": Short("--count 1 --seed 71"),
+    "python -m tests.faults.long": Short("--updates 20 seed=71"),
+    "python -m tests.claims --quick": Short("--only soak"),
+    "python -m tests.claims --only tests.campaign": Short("--quick"),
+    "python -m tests.claims": Short("--quick --only soak"),
+    "python docs/pictures.py prove": Short(),
+}
+#: Inline names of programs that are no commands.
+PROGRAMS = ("python -m torch_qpmpc.train", "python -m torch_qpmpc.report", "python -m tests...")
+#: Inline commands that a page's own ones stand for.
+TEMPLATES = ("python -m torch_qpmpc.report FOLDER", "python train.py resume=FOLDER")
+
+
+def commands(text: str) -> list[str]:
+    """Return the lines of Python and bash in a page's blocks and between its backticks."""
+    blocks = [code.replace("\\\n", "") for _, code in fenced(text, "bash")]
+    lines = [part for code in blocks for line in code.splitlines() for part in line.split("&&")]
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    lines += re.findall(r"`(python3? (?:-m )?[\w/]+\.[^`\n]*)`", prose)
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [shlex.join(x) for x in words if x and re.fullmatch(r"python3?|bash", x[0])]
+
+
+def documented() -> dict[str, list[str]]:
+    """Return the commands of each page and notebook, each once, in order."""
+    texts = dict(PAGES)
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        lines = ["".join(cell["source"]) for cell in cells]
+        texts[path.relative_to(ROOT).as_posix()] = "\n".join(lines)
+    found = {page: list(dict.fromkeys(commands(text))) for page, text in texts.items()}
+    names = {*PROGRAMS, *TEMPLATES}
+    return {page: [x for x in of if x not in names] for page, of in found.items()}
+
+
+DOCUMENTED = documented()
+NAMED = {shlex.join(shlex.split(command)): short for command, short in SHORT.items()}
+
+
+def test_each_documented_command_has_an_entry():
+    found = {command: page for page, of in DOCUMENTED.items() for command in of}
+    unknown = [f"{page}: {x}" for x, page in found.items() if x not in {*NAMED, *CANNOT}]
+    assert not unknown, "shorten it in SHORT, or say in CANNOT why it does not run"
+    assert not {*NAMED, *CANNOT} - {*found}, "no page has it any more"
+    assert not {*NAMED} & {*CANNOT}
+
+
+@pytest.mark.usefixtures("rough_fits")
+@pytest.mark.parametrize("command", [x for x, short in NAMED.items() if short.quick])
+def test_a_command_of_one_run_ends(command, tmp_path, monkeypatch):
+    """With its tables: nothing is missing at the end."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    quiet = ("figures=false", "hydra.run.dir=run")
+    run_command(*shlex.split(f"{command} {NAMED[command].more}")[2:], *quiet)
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert summary["seed"] == 71
+    assert "missing" not in summary
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page, of in DOCUMENTED.items() if of])
+def test_the_commands_of_a_page_end(page, tmp_path, capsys):
+    """One after the other, as a reader would run them, in a copy of the repository."""
+    skip = shutil.ignore_patterns(".*", "venv", "runs", "site", "__pycache__")
+    clone = Path(shutil.copytree(ROOT, tmp_path / "clone", ignore=skip))
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(clone), "OMP_NUM_THREADS": "1"}
+    blocks = [code for _, code in fenced(PAGES.get(page, ""), "python")]
+    for command in DOCUMENTED[page]:
+        short, began = NAMED.get(command), time.perf_counter()
+        needs = () if short is None else short.needs
+        absent = [x for x in needs if not importlib.util.find_spec(x)]
+        if short is None or absent:
+            why = CANNOT.get(command) or f"{', '.join(absent)} is not installed"
+            with capsys.disabled():
+                print(f"\n   not run  {command}: {why}", end="")
+            continue
+        for name, part in short.files:
+            script = next(code for code in blocks if part in code)
+            (clone / name).write_text(script, encoding="utf-8")
+        words = short.instead or f"{command} {short.more}"
+        ended = subprocess.run(
+            ["bash", "-c", words],
+            cwd=clone,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=1200,
+            check=False,
+        )
+        with capsys.disabled():
+            print(f"\n{time.perf_counter() - began:8.1f} s  {command}", end="")
+        assert ended.returncode == 0, f"{words}\n{ended.stdout[-2000:]}\n{ended.stderr[-3000:]}"
