@@ -49,7 +49,7 @@ def target() -> Any:
 def arranged(**changes: Any) -> Tensor:
     known = torch.linspace(0, 1, 6).unsqueeze(-1)
     signals = {"x": [1.0, 0.5], "u_last": [0.1], "known": known, "level": [0.2]} | changes
-    return linear().value(linear().arrange(target=target(), **signals))
+    return linear().plan.value(linear().arrange(target=target(), **signals))
 
 
 @functools.cache
@@ -78,7 +78,7 @@ DIFFERENTIATED: dict[str, tuple[Callable[[Tensor], Tensor], Any]] = {
     "arrange known": (lambda t: arranged(known=t), [[0.1]] * 6),
     "arrange level": (lambda t: arranged(level=t), [0.2]),
     "arrange target": (
-        lambda t: linear().value(linear().arrange([1.0, 0.5], target()._replace(x=t))),
+        lambda t: linear().plan.value(linear().arrange([1.0, 0.5], target()._replace(x=t))),
         [0.3, 0.0],
     ),
     "DeviationPenalty C": (lambda t: qm.DeviationPenalty(scheme())(t), scheme().C_0 + 0.1),

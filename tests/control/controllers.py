@@ -41,8 +41,8 @@ def learned(references: str = "held", rate: float = 1e-3, **options) -> qm.Linea
         learn=("H", "q", "c", "C", "b", "lb", "ub", "w"),
         **options,
     )
-    optimizer = torch.optim.SGD(mpc.parameters(), lr=rate)
-    mpc.value(torch.linspace(-0.5, 0.5, mpc.n_p)).backward()
+    optimizer = torch.optim.SGD(mpc.plan.parameters(), lr=rate)
+    mpc.plan.value(torch.linspace(-0.5, 0.5, mpc.plan.n_p)).backward()
     optimizer.step()
     return mpc
 

@@ -256,7 +256,7 @@ def test_new_bounds_and_weights_keep_the_estimates():
             assert np.array_equal(before, np.concatenate((controller.x, controller.w)))
         if k > 30:
             assert 0 <= u[0] <= 6.0
-    fresh, now = (one.mpc.quadratic_program() for one in (tanks(**changed), controller))
+    fresh, now = (one.mpc.plan.quadratic_program() for one in (tanks(**changed), controller))
     assert all(map(torch.equal, fresh.tensors(), now.tensors()))
     controller.redesign(u_bounds=(0.0, 3.0))
     assert controller.u[0] == 3.0

@@ -196,8 +196,9 @@ def test_a_step_is_that_of_the_differentiable_parts(seed, references):
         e = np.linalg.solve(observer.F, e - observer.predicted(np.zeros_like(e), u, d[0]))
         target = mpc.target(r if references == "preview" else r[0], e[3:], d.mean(0))
         p = mpc.arrange(e[:3], target, u_last=u_last, known=d, level=d.mean(0))
-        plan = mpc.solve(p, warm_start=mpc.solve(p))
-        expected = (target.u[-1] if references == "preview" else target.u) + plan.z[mpc.n_p :][:2]
+        plan = mpc.plan.solve(p, warm_start=mpc.plan.solve(p))
+        last = target.u[-1] if references == "preview" else target.u
+        expected = last + plan.z[mpc.plan.n_p :][:2]
         assert controller.status == 0
         assert np.abs(u - expected.clamp(-0.5, 0.5).numpy()).max() < 1e-7
         active += int(plan.active.any())

@@ -73,7 +73,7 @@ def test_its_gradient_is_that_of_finite_differences(case):
 
     _Loops(plant, 3, 1).mean_cost(mpc, 6).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
-    for name, leaf in mpc.coordinates().items():
+    for name, leaf in mpc.plan.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:
             continue
         direction = torch.randn(leaf.shape, generator=generator).double() * leaf.detach().abs()
@@ -99,7 +99,7 @@ def test_its_loops_are_the_controllers_own(case):
         for _ in range(6):
             base, u_last, r, u_s, p = s.split(plant._ends, -1)
             _, e, y, *_ = plant._parts(base)
-            a = controller.mpc.policy(p)
+            a = controller.mpc.plan.policy(p)
             u, costs = u_s + a, plant.cost(s, a)
             ahead = plant._ahead(base, 5).numpy()
             for i in range(3):
@@ -120,13 +120,13 @@ def test_its_loops_are_the_controllers_own(case):
 def test_it_stays_away_from_a_bound_that_noise_violates():
     controller = made("bounds", learn=("H", "H_f", "q", "b"))
     controller.reset(y={"T": 20.0}, u={"q": 5.0}, known={"d": 0.0, "price": 1.0, "top": 21.0})
-    before, u = copy.deepcopy(controller.mpc.state_dict()), controller.u
+    before, u = copy.deepcopy(controller.mpc.plan.state_dict()), controller.u
     options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
     report = controller.improve(logged(), **options)
     assert report.kept
     assert report.after < 0.9 * report.before
     assert len(report.curve) == 8
-    assert not all(torch.equal(before[k], x) for k, x in controller.mpc.state_dict().items())
+    assert not all(torch.equal(before[k], x) for k, x in controller.mpc.plan.state_dict().items())
     assert np.array_equal(controller.u, u)
     now = {"d": 0.0, "price": 1.0, "top": 21.0}
     assert 0 <= controller.step(y={"T": 20.5}, r={"T": 20.9}, known=now)["q"] <= 10

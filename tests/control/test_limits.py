@@ -48,7 +48,7 @@ def test_constant_signals_are_constant_bounds(r, options):
     for x in rng.uniform(-3, 3, (12, 2)):
         signals = {"x": x, "u_last": rng.uniform(-1, 0.6, 2)}
         p = own.arrange(target=target, known=np.tile(level, (N + 1, 1)), level=level, **signals)
-        u, v = own.policy(p), twin.policy(twin.arrange(target=same, **signals))
+        u, v = own.plan.policy(p), twin.plan.policy(twin.arrange(target=same, **signals))
         assert torch.allclose(target.u + u, same.u + v, atol=1e-6)
 
 
@@ -58,7 +58,7 @@ def test_every_stage_of_a_plan_keeps_its_own_bound(options):
     controller.step([0.0, 0.0], [4.0, 0.0], known=rows(-9.0, caps))
     mpc = controller.mpc
     assert controller.target is not None
-    u = controller.target.u[0] + mpc.predicted(mpc.solve(controller.p).z)[1][:, 0]
+    u = controller.target.u[0] + mpc.plan.predicted(mpc.plan.solve(controller.p).z)[1][:, 0]
     assert (u.numpy() <= caps[:N] + 1e-7).all()
     assert np.isclose(u.numpy(), caps[:N], atol=1e-6).sum() >= 3, "bounds decide"
 

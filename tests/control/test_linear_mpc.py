@@ -101,7 +101,7 @@ def test_the_plan_is_that_of_the_problem_in_the_docstring(references, blocks, he
         assert np.allclose(last, expected.u, atol=1e-8)
         u = reference(x, expected, r, known, u_last, held)
         p = mpc.arrange(x, target, known=known, level=d, u_last=u_last)
-        assert np.allclose(last + mpc.policy(p).detach(), u, atol=1e-5)
+        assert np.allclose(last + mpc.plan.policy(p).detach(), u, atol=1e-5)
 
 
 def test_an_input_weight_moves_no_output_off_a_set_point_that_can_be_reached():
@@ -109,7 +109,7 @@ def test_an_input_weight_moves_no_output_off_a_set_point_that_can_be_reached():
     expected = steady_state(np.array([0.3, -0.2]), np.zeros(2), np.zeros(2))
     target = mpc.target([0.3, -0.2])
     assert np.allclose(target.u, expected.u)
-    assert mpc.policy(mpc.arrange(expected.x, target)).abs().max() < 1e-8
+    assert mpc.plan.policy(mpc.arrange(expected.x, target)).abs().max() < 1e-8
 
 
 def test_a_set_point_out_of_reach_is_tracked_as_near_as_the_bounds_allow():
@@ -127,7 +127,7 @@ def test_an_integrator_with_a_load_beyond_its_input_s_bounds_has_a_target():
     target = mpc.target([0.5], w=[3.0])
     assert np.allclose([*target.y, *target.u], [0.5, -3.0])
     p = mpc.arrange([0.5], target, u_last=[-1.0])
-    assert np.allclose(target.u + mpc.policy(p).detach(), -1.0)
+    assert np.allclose(target.u + mpc.plan.policy(p).detach(), -1.0)
 
 
 def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
@@ -139,8 +139,8 @@ def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
 def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
     # The position has no weight and does not decay.
     mpc = qm.LinearMPC(([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]]), 3, Q=[0.0, 1.0], R=1.0)
-    assert torch.equal(mpc.H_f.detach()[:2, :2], torch.diag(torch.tensor([0.0, 2.0])).double())
-    assert mpc.H_f.detach()[2:].abs().max() == 0
+    assert torch.equal(mpc.plan.H_f.detach()[:2, :2], torch.diag(torch.tensor([0.0, 2.0])).double())
+    assert mpc.plan.H_f.detach()[2:].abs().max() == 0
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
@@ -155,20 +155,29 @@ def test_rounding_does_not_decide_on_a_riccati_solution_without_a_cost(unit):
     assert riccati(qm.LinearMPC((A, B, C), 3, Q=[q, 0.0], dR=0.1).design) is not None
 
 
+def test_an_mpc_has_a_plan_and_is_none():
+    """`QPMPC.of` and others were inherited, and failed."""
+    mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1, learn=("H",))
+    assert not {"of", "from_model", "from_data", "policy"} & {*dir(mpc)}
+    assert mpc.plan.constants == {mpc.plan.n_p - 1: 1.0}
+    assert mpc.options["learn"] == {"H": True}
+    assert repr(mpc) == "LinearMPC(y1 by u1; horizon 3; Q [1.0]; dR [0.1]; learned H)"
+
+
 def test_copies_keep_the_design():
     mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1)
     for twin in (pickle.loads(pickle.dumps(mpc)), copy.deepcopy(mpc)):
         assert twin.design.places == mpc.design.places
         p = twin.arrange([1.0], twin.target([0.5]))
-        assert torch.equal(twin.policy(p), mpc.policy(p))
-    mpc.reset_parameters()
+        assert torch.equal(twin.plan.policy(p), mpc.plan.policy(p))
+    mpc.plan.reset_parameters()
 
 
 def test_p_takes_batches_and_is_relative_to_the_last_target():
     mpc = qm.LinearMPC((A, B, C), 8, E=E, references="preview", **NAMES, **DESIGN)
     r = np.linspace(0, 0.1, 9)[:, None] * np.ones((5, 1, 2))
     p = mpc.arrange(np.ones((5, 3)), mpc.target(r), known=np.ones((5, 9, 2)))
-    assert tuple(p.shape) == (5, mpc.n_p)
+    assert tuple(p.shape) == (5, mpc.plan.n_p)
     assert np.allclose(p[0, :2], -0.1)  # r_0 - r_N
     assert p[0, 4:6].tolist() == [1, 1]
     assert p[0, 48 : 48 + 4].abs().max() < 1e-12

@@ -52,7 +52,7 @@ def content(controller: qm.Controller) -> dict[str, Any]:
     """Return what a redesign may change, as arrays and plain values by name."""
     design = controller.mpc.design
     parts = {x.name: getattr(design, x.name) for x in fields(Design)}
-    theta = [x.detach().numpy() for x in controller.mpc.quadratic_program().tensors()]
+    theta = [x.detach().numpy() for x in controller.mpc.plan.quadratic_program().tensors()]
     parts |= {"L": controller.observer.L, "theta": theta}
     return {name: part for name, part in parts.items() if name not in ("plant", "disturbances")}
 

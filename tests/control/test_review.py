@@ -159,7 +159,7 @@ def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
         (u,) = looped.step(y, [0.0])
         cost += float(y @ y) + 0.1 * (u - last) ** 2
         x, last = 0.9 * (x + 0.02 * (k == 1)) + 0.5 * u, u
-    tables = make_tables(mpc), make_tables(mpc.targets)
+    tables = make_tables(mpc.plan), make_tables(mpc.targets)
     linear, noise = LinearLoop.of(mpc, looped.observer, *tables), mpc.design.plant.noise
     assert noise is not None
     assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
@@ -277,7 +277,7 @@ def test_a_learned_cost_that_is_indefinite_is_named():
     mpc = qm.LinearMPC(LAG, 5, Q=1.0, R=0.1, structure="free", step="projection", learn=("H",))
     assert qm.Controller(mpc).review().faults == []
     with torch.no_grad():
-        for leaf in mpc.leaves("H"):
+        for leaf in mpc.plan.leaves("H"):
             leaf -= 1.0
     found = qm.Controller(mpc).review()
     assert "Learning has made it indefinite" in found["cost"].remedy
@@ -292,7 +292,7 @@ def test_a_learned_cost_that_is_indefinite_is_named():
 def test_the_linear_loop_is_that_of_the_controller(options):
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, **options)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc, mpc.targets)))
+    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc.plan, mpc.targets)))
     A, B, C = loop.plant
     state, constant = np.zeros(len(loop.A)), np.array([0.1, -0.2, 0.3])  # load, bias and r
     controller.reset(y=[0.0])
@@ -308,7 +308,7 @@ def test_the_margin_is_that_of_the_loop_s_gain():
     """The loop is unstable from the gain on that the margin of one input allows at least."""
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc, mpc.targets)))
+    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc.plan, mpc.targets)))
     A_c, B_c, C_c, D_c = loop.controller
     A, B, C = loop.plant
     margin = loop.modulus_margin()

@@ -32,7 +32,7 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     inputs(controller)
     controller.save(tmp_path / "mine.qpmpc")
     twin = qm.Controller.load(tmp_path / "mine.qpmpc")
-    assert twin.mpc.learned == controller.mpc.learned
+    assert twin.mpc.plan.learned == controller.mpc.plan.learned
     assert np.array_equal(inputs(twin), inputs(controller))
     assert twin.known is not None
     assert twin.known.tolist() == [0.3, 0.19]
@@ -58,19 +58,19 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     assert torch.equal(
         p, mpc.arrange([0.3, 0.1], mpc.target([0.5], w=[0.1]), known=known, level=[1.0, 1.0])
     )
-    assert torch.equal(twin.value(p), mpc.value(p))
-    assert torch.equal(plain.policy(p), mpc.policy(p))
-    twin.reset_parameters()
-    mpc.reset_parameters()
-    assert torch.equal(twin.value(p), mpc.value(p))
+    assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
+    assert torch.equal(plain.policy(p), mpc.plan.policy(p))
+    twin.plan.reset_parameters()
+    mpc.plan.reset_parameters()
+    assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
 
 
 def test_arguments_are_those_of_its_qp():
     mpc = learned()
-    plain = qm.QPMPC.of(**mpc.arguments)
-    plain.load_state_dict(mpc.state_dict())
-    p = torch.linspace(-0.1, 0.1, mpc.n_p, dtype=torch.float64)
-    assert torch.equal(plain.policy(p), mpc.policy(p))
+    plain = qm.QPMPC.of(**mpc.plan.arguments)
+    plain.load_state_dict(mpc.plan.state_dict())
+    p = torch.linspace(-0.1, 0.1, mpc.plan.n_p, dtype=torch.float64)
+    assert torch.equal(plain.policy(p), mpc.plan.policy(p))
 
 
 def test_later_releases_read_the_first_format():

@@ -296,7 +296,7 @@ def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
         constraint_slack=torch.inf,
         solver="daqp",
     )
-    for mpc, value in ((constant, 1.0), (fixed, 2.0)):
+    for mpc, value in ((constant.plan, 1.0), (fixed, 2.0)):
         tables = make_tables(mpc)
         last = draw(tables, 20)[:, -1]
         assert abs(last - value).max() < 1e-12
@@ -324,7 +324,7 @@ def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_ce
 ):
     """All inputs are at bounds: gap and action are what the rounding of Q makes of lambda."""
     horizon = 20 if pole < 2 else 12
-    mpc = qm.LinearMPC(([[pole]], [[1.0]]), horizon, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
+    mpc = qm.LinearMPC(([[pole]], [[1.0]]), horizon, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0)).plan
     agreement = export_c(mpc, tmp_path).agreement
     assert agreement is not None
     assert (agreement.solved, agreement.unsolved) == (agreement.states, 0)

@@ -35,9 +35,18 @@ def test_each_row_of_D_and_D_f_may_have_its_own_price():
     assert w[5:].tolist() == [2, torch.inf, 2, torch.inf, 3]
 
 
+def test_rows_that_hold_through_a_block_are_those_of_actions_or_named():
+    rows = ([[1.0, 0.0], [0.0, 1.0]], [-1.0] * 2, [1.0] * 2)
+    scheme = Scheme(Layout(1, 1, horizon=2), bounds=Bounds(constraints=rows))
+    assert scheme.of_actions.tolist() == [False, True]
+    named = Scheme(Layout(1, 1, horizon=2), bounds=Bounds(constraints=rows, held=[True, True]))
+    assert named.of_actions.tolist() == [True, True]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        ({"held": [True]}, r"held: got shape \(1,\), expected \(0,\): one entry per row"),
         ({"state_bounds": 5.0}, r"state_bounds: got 5.0, expected the pair \(lower, upper\)"),
         (
             {"state_bounds": ([1.0], [1.0, 2.0])},

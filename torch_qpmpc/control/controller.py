@@ -36,7 +36,7 @@ class Controller:
     no offset, and a set-point out of reach is tracked as near as the bounds allow.
 
     Args:
-        mpc: the MPC. Call `reset` when its theta has changed.
+        mpc: the MPC. Call `reset` when its plan's theta has changed.
         noise: standard deviations of the outputs' noise, as a number, a vector or by name; by
             default the identification's. Without one, a tenth of half the distance between the
             output's bounds or, without bounds, of the deviation that costs one, ``1 / sqrt(Q)``.
@@ -109,7 +109,7 @@ class Controller:
         self._memory = memory
         self.status = Outcome.SOLVED
         self.target: Target | None = None
-        self.p = torch.zeros(self.mpc.n_p)
+        self.p = torch.zeros(self.mpc.plan.n_p)
 
     def __repr__(self) -> str:
         """Return its design and the last input."""

@@ -150,7 +150,7 @@ def export_controller(
         want = "bounds that the set-point determines"
         raise QPError.expected("controller", got, want, WEIGHT.format(names))
     with tempfile.TemporaryDirectory() as temporary:
-        plan = export_c(mpc, temporary, name=f"{name}_plan", **options)
+        plan = export_c(mpc.plan, temporary, name=f"{name}_plan", **options)
         target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
         free = None
         if mpc.free is not None:
@@ -354,11 +354,11 @@ def _moves(mpc: LinearMPC, dtype: str) -> Array:
     design = mpc.design
     m, last = design.plant.sizes[1], design.places["u_last"].start - design.places["known"].stop
     bounds = np.outer([-np.inf, np.inf], np.ones(m))
-    qp = mpc.quadratic_program()
+    qp, n_p, n_x = mpc.plan.quadratic_program(), mpc.plan.n_p, mpc.plan.n_x
     G, *sides = (x.detach().double().cpu().numpy() for x in (qp.G, qp.lb, qp.ub))
     for i in range(m if design.moves else 0):
         row = np.zeros(G.shape[1])
-        row[[mpc.n_p - mpc.n_x + last + i, mpc.n_p + i]] = -1, 1
+        row[[n_p - n_x + last + i, n_p + i]] = -1, 1
         for k in np.flatnonzero((row == G).all(1)):
             bounds[:, i] = [side[k] for side in sides]
     size = largest(bounds)

@@ -132,7 +132,7 @@ class Law:
     @cached_property
     def plans(self) -> AtRest:
         """The solver of the plan's QP, with the theta of its first use."""
-        return self.mpc.at_rest()
+        return self.mpc.plan.at_rest()
 
     @cached_property
     def aims(self) -> list[AtRest]:
@@ -182,7 +182,7 @@ class Law:
             memory = memory._replace(r=r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
-        n, mpc, level = len(design.plant.A), self.mpc, known.mean(0)
+        n, qp, level = len(design.plant.A), self.mpc.plan, known.mean(0)
         previewed, aimed = design.references == "preview", []
         for row in r if previewed else r[:1]:
             if (steady := self._aimed(row, e[n:], level)) is None:
@@ -194,7 +194,7 @@ class Law:
         if plan.status[0]:
             proved = plan.status[0] == Status.INFEASIBLE
             return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
-        u = self._within(aimed[-1][1] + plan.z[0, mpc.n_p : mpc.n_p + mpc.n_u], memory)
+        u = self._within(aimed[-1][1] + plan.z[0, qp.n_p : qp.n_p + qp.n_u], memory)
         target = Target(*map(torch.from_numpy, steady))
         return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p))
 

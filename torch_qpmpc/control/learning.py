@@ -26,7 +26,6 @@ from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.lowering import lowered
 from torch_qpmpc.control.observer import SMALL
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.simulation import Run, simulate
@@ -39,7 +38,6 @@ from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlant, ensemble
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
-from torch_qpmpc.mpc.scheme import KEYWORDS
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
@@ -262,7 +260,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     scaling = replace(old, plant=plant).scaling
     w = choose(plant, "auto" if old.disturbances.names else None, scaling)
     design = replace(old, plant=plant, disturbances=w)
-    mpc = LinearMPC(lowered(design), **{name: law.mpc.arguments[name] for name in KEYWORDS})
+    mpc = LinearMPC.of_design(design, **law.mpc.options)
     drift = law.drift if w.names == old.disturbances.names else None
     return Law.of(mpc, law.noise, drift)
 
@@ -304,7 +302,7 @@ def improve(
     set_points = _set_points(law.design, log, middle, spread)
     models = ensemble(_identified(log, law.design.plant), members, seed)
     law = replace(law, mpc=copy.deepcopy(law.mpc))
-    return descend(law.mpc, ControlledPlant(law, models, log, *set_points), **options), law
+    return descend(law.mpc.plan, ControlledPlant(law, models, log, *set_points), **options), law
 
 
 class ControlledPlant(SimulatedPlant):
@@ -330,7 +328,7 @@ class ControlledPlant(SimulatedPlant):
         inside = (self._y.clamp(*self._levels[2:]) == self._y).all(-1)
         self._rows = self._rows[inside | ~inside.any()]
         m, n_y = len(law.design.R), len(middle)
-        self._ends = [sum(self._sizes), m, n_y, m, law.mpc.n_p]
+        self._ends = [sum(self._sizes), m, n_y, m, law.mpc.plan.n_p]
 
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
         s = super().starts(rng, count)

@@ -1,4 +1,4 @@
-"""`LinearMPC`: a linear MPC in an engineer's terms, lowered onto `QPMPC` by a scheme."""
+"""`LinearMPC`: a linear MPC in an engineer's terms, whose QPs are `QPMPC`s."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torch_qpmpc.control.design import (
     signals_of,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import Affine, LinearScheme, free_mpc, lowered, target_mpc
+from torch_qpmpc.control.lowering import free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
@@ -33,7 +33,6 @@ from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
 from torch_qpmpc.mpc.state import KIND, check_own, stored
-from torch_qpmpc.qp.program import QuadraticProgram
 
 
 class Target(NamedTuple):
@@ -44,8 +43,12 @@ class Target(NamedTuple):
     y: Tensor
 
 
-class LinearMPC(Affine):
-    """A linear MPC with set-points, prices of moves and disturbances: a `QPMPC`.
+#: The options of a plan's `QPMPC`.
+OPTIONS = {"structure": "tied", "learn": (), "solver": "daqp"}
+
+
+class LinearMPC:
+    """A linear MPC with set-points, prices of moves and disturbances.
 
     The plan's cost is the sum over the stages of
 
@@ -61,7 +64,7 @@ class LinearMPC(Affine):
     u_last is in it if moves cost or are bounded, and y_s and u_s have the entries with bounds.
     The last entry adds a small constant to the values, which their errors are relative to. With
     ``references="preview"`` d_k begins with the set-points and inputs of later stages. `target` and
-    `arrange` make p, and the policy is u - u_s; `Controller` does all of it.
+    `arrange` make p, and the `plan`'s policy is u - u_s; `Controller` does all of it.
 
     Args:
         model, E, dt, inputs, outputs, known: the plant; see `read_model`.
@@ -80,10 +83,12 @@ class LinearMPC(Affine):
         blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
             ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves then hold between blocks.
         gamma: the discount.
-        options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of `QPMPC`; by
-            default a tied structure that learns nothing, and DAQP.
+        options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of the plan's
+            `QPMPC`; by default a tied structure that learns nothing, and DAQP.
 
     Attributes:
+        design: the `Design` of the arguments.
+        plan: the `QPMPC` of the plan, with V, Q, the policy and what is learned.
         targets: the QPMPC whose policy maps [r; w; d; 1] to the target; see
             `torch_qpmpc.control.lowering`.
         free: the one of the inputs that the target leaves free, None if there are none.
@@ -97,14 +102,9 @@ class LinearMPC(Affine):
         >>> mpc = qm.LinearMPC(model, 10, Q=1.0, R=0.1, dR=0.1, u_bounds=(-1.0, 1.0))
         >>> target = mpc.target(r=[2.0])
         >>> p = mpc.arrange(x=[2.0], u_last=[0.4], target=target)
-        >>> target.u + mpc.policy(p).detach()  # at the set-point the input that holds it
+        >>> target.u + mpc.plan.policy(p).detach()  # at the set-point the input that holds it
         tensor([0.4000], dtype=torch.float64)
     """
-
-    scheme: LinearScheme
-    targets: QPMPC
-    free: QPMPC | None
-    _target_qps: list[QuadraticProgram]
 
     def __init__(
         self,
@@ -130,10 +130,6 @@ class LinearMPC(Affine):
         known: Sequence[str] = (),
         **options: Any,
     ) -> None:
-        if isinstance(model, LinearScheme):  # as copies and pickles pass it
-            super().__init__(model, **options)
-            self._start_targets()
-            return
         check_keywords("LinearMPC", options, [*KEYWORDS, *signature(LinearMPC).parameters])
         prices = [*linear.values()] if isinstance(linear, Mapping) else []
         prices += [*signals_of(y_bounds), *signals_of(u_bounds)]
@@ -154,21 +150,44 @@ class LinearMPC(Affine):
             gamma=gamma,
             blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
         )
-        defaults = {"structure": "tied", "learn": (), "solver": "daqp"}
-        super().__init__(lowered(design), **{**defaults, **options})
-        self._start_targets()
+        self._start(design, options)
 
-    def _start_targets(self) -> None:
-        """Make the QPs of the target, which are not learned and no submodules."""
-        targets, free = target_mpc(self.design), free_mpc(self.design)
-        qps = [mpc.quadratic_program() for mpc in (targets, free) if mpc is not None]
-        vars(self).update(targets=targets, free=free, _target_qps=qps)
+    @classmethod
+    def of_design(cls, design: Design, **options: Any) -> LinearMPC:
+        """Return the MPC of a design.
+
+        Args:
+            design: the `Design`.
+            options: those of the plan, as the constructor takes them.
+
+        Raises:
+            QPError: an option is invalid.
+        """
+        mpc = cls.__new__(cls)
+        mpc._start(design, options)
+        return mpc
+
+    def _start(self, design: Design, options: dict[str, Any]) -> None:
+        """Make the QPs; those of the target are not learned."""
+        self.design, self.plan = design, QPMPC(lowered(design), **{**OPTIONS, **options})
+        self.targets, self.free = target_mpc(design), free_mpc(design)
+        aims = [mpc for mpc in (self.targets, self.free) if mpc is not None]
+        self._target_qps = [mpc.quadratic_program() for mpc in aims]
 
     @property
-    def design(self) -> Design:
-        """The `Design` of the arguments."""
-        assert self.scheme.design is not None
-        return self.scheme.design
+    def horizon(self) -> int:
+        """The number of stages, N."""
+        return self.design.horizon
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of the plan's `QPMPC`."""
+        return {name: self.plan.arguments[name] for name in KEYWORDS}
+
+    def __repr__(self) -> str:
+        """Return its design and what it learns."""
+        learned = f"; learned {', '.join(self.plan.learned)}" * bool(self.plan.learned)
+        return f"LinearMPC({self.design}{learned})"
 
     def redesigned(self, **changes: Any) -> LinearMPC:
         """Return this MPC with other bounds or weights.
@@ -179,20 +198,17 @@ class LinearMPC(Affine):
         Raises:
             QPError: an argument is invalid, or this MPC learns.
         """
-        if self.learned:
-            got, remedy = f"an MPC that learns {', '.join(self.learned)}", "Change its parameters."
+        if learned := ", ".join(self.plan.learned):
+            got, remedy = f"an MPC that learns {learned}", "Change the parameters of its plan."
             raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
         wishes = read_wishes(self.design.plant, self.design, **changes)
         design = replace(self.design, **wishes)
-        return LinearMPC(lowered(design), **{name: self.arguments[name] for name in KEYWORDS})
-
-    def extra_repr(self) -> str:
-        return f"{self.design}, {super().extra_repr()}"
+        return LinearMPC.of_design(design, **self.options)
 
     def save(self, path: str | Path) -> None:
         """Write this MPC with its design to the file ``path``, as `QPMPC.save` does.
 
-        `LinearMPC.load` reads it, and `QPMPC.load` its QP alone.
+        `LinearMPC.load` reads it, and `QPMPC.load` its plan's QP alone.
 
         Raises:
             QPError: a part has a parametrization that is not QPMPC's own.
@@ -222,15 +238,16 @@ class LinearMPC(Affine):
         Raises:
             QPError: a part has a parametrization that is not QPMPC's own.
         """
-        check_own("save", self)
-        return {**stored(self), "design": packed(self.design)}
+        check_own("save", self.plan)
+        return {**stored(self.plan), "design": packed(self.design)}
 
     @classmethod
     def of_stored(cls, content: Mapping[str, Any]) -> LinearMPC:
         """Return the LinearMPC of the ``content`` of a file."""
-        scheme = lowered(read_stored(content["design"]))
-        mpc = cls(scheme, **{name: content["arguments"][name] for name in KEYWORDS})
-        mpc.load_state_dict(content["mpc"])
+        options = {name: content["arguments"][name] for name in KEYWORDS}
+        mpc = cls.of_design(read_stored(content["design"]), **options)
+        if mpc.plan.learned:  # else theta is the design's
+            mpc.plan.load_state_dict(content["mpc"])
         return mpc
 
     def target(self, r: Any, w: Any = 0.0, known: Any = None) -> Target:

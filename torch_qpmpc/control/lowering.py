@@ -16,7 +16,6 @@ their digits; it remains where f moves an output with soft bounds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -24,7 +23,6 @@ import numpy as np
 import scipy.linalg
 import torch
 from scipy.linalg import block_diag
-from torch import Tensor
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import RANK, null_direction, unseen_modes
@@ -53,38 +51,14 @@ HARD = 1e3
 NEARLY_HARD = 1e3
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LinearScheme(Scheme):
-    """The scheme of a linear MPC, with the design that it is made from."""
-
-    design: Design | None = None
-
-    @property
-    def of_actions(self) -> Tensor:
-        """True for rows of inputs and moves without known signals: constant in a block."""
-        if self.bounds.constraints is None:
-            return super().of_actions
-        D, layout = self.bounds.constraints[0], self.layout
-        return D[:, -layout.n_u :].any(-1) & ~D[:, : layout.n_d].any(-1)
-
-
-class Affine(QPMPC):
-    """A QPMPC whose p ends with a one."""
-
-    @property
-    def constants(self) -> dict[int, float]:
-        """The last entry of p, which is one."""
-        return {self.n_p - 1: 1.0}
-
-
-def lowered(design: Design) -> LinearScheme:
-    """Return the scheme of a design, in deviations from the target."""
+def lowered(design: Design) -> Scheme:
+    """Return the scheme of a design's plan, in deviations from the target."""
     places = design.places
     n_d = places["known"].stop
     n_x, n_u = places["u"].start - n_d, design.plant.sizes[1]
     layout = Layout(n_x, n_u, design.horizon, n_d, blocks=design.blocks)
     parts = _model(design), _cost(design, layout), _bounds(design)
-    return LinearScheme(layout, *parts, design.gamma, design=design)
+    return Scheme(layout, *parts, design.gamma, constants={layout.n_p - 1: 1.0})
 
 
 def _model(design: Design) -> Model:
@@ -167,7 +141,10 @@ def _costless(design: Design) -> bool:
 
 
 def _bounds(design: Design) -> Bounds:
-    """Return rows of the outputs at their prices, and hard ones of inputs and moves."""
+    """Return rows of the outputs at their prices, and hard ones of inputs and moves.
+
+    The latter hold in all stages of a block but for those with known signals.
+    """
     s, size = design.selectors(), design.places["u"].start
     moving = np.isfinite(design.du_bounds).any(0)
     of_y, of_u = design.bounded
@@ -182,11 +159,13 @@ def _bounds(design: Design) -> Bounds:
     limits = du, *(side[moving] for side in design.du_bounds)
     D, lower, upper = map(np.concatenate, zip(soft, hard, limits, strict=True))
     n_y, price = len(soft[0]), design.y_slack[places][priced]
+    held = D[:, size:].any(-1) & ~D[:, : design.places["known"].stop].any(-1)
     return Bounds(
         constraints=(D, lower, upper) if len(D) else None,
         terminal_constraints=(soft[0][:, :size], *soft[1:]) if n_y else None,
         constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
         discount_slack=True,
+        held=held if len(D) else None,
     )
 
 
@@ -249,15 +228,16 @@ def free_mpc(design: Design) -> QPMPC | None:
 
 def _of_one_stage(
     n_x: int, weight: Any, constant: float, rows: tuple[Array, ...], slack: Array
-) -> Affine:
+) -> QPMPC:
     """Return the QPMPC with the rows (D, lower, upper), whose state has no cost at its end."""
     n_v = len(weight) - n_x
     weight[n_x - 1, n_x - 1] += 2 * constant
     cost = Cost(weight, np.zeros((n_x, n_x)), hessian="block")
     model = Model(np.eye(n_x), np.zeros((n_x, n_v)))
     bounds = Bounds(constraints=rows, constraint_slack=slack) if len(rows[0]) else Bounds()
-    scheme = Scheme(Layout(n_x, n_v, horizon=1), model, cost, bounds, gamma=1.0)
-    return Affine(scheme, learn=(), solver="daqp")
+    layout, one = Layout(n_x, n_v, horizon=1), {n_x - 1: 1.0}
+    scheme = Scheme(layout, model, cost, bounds, gamma=1.0, constants=one)
+    return QPMPC(scheme, learn=(), solver="daqp")
 
 
 def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array, Array]:

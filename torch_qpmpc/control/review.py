@@ -118,7 +118,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     ]
     if not cost.ok:
         return Review(findings)
-    plan, target = make_tables(mpc), make_tables(mpc.targets)
+    plan, target = make_tables(mpc.plan), make_tables(mpc.targets)
     qps = [plan, target, *([] if mpc.free is None else [make_tables(mpc.free)])]
     loop = LinearLoop.of(mpc, law.observer, plan, target)
     findings.append(_condition(design, *cost.numbers.values()))
@@ -137,21 +137,23 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
 
 def _cost(mpc: LinearMPC) -> Finding:
     """H is positive definite on the plans that satisfy C z = b, in signals divided by sizes."""
-    qp, design = mpc.quadratic_program(), mpc.design
+    qp, design = mpc.plan.quadratic_program(), mpc.design
     y, u, x, _ = design.scaling
     state = (x, u[: len(u) * design.moves], y[design.bounded[0]], u[design.bounded[1]], [1.0])
     later = np.tile(np.concatenate((u, *state)), mpc.horizon)
-    units = np.concatenate((np.ones(mpc.n_p), later))
+    units = np.concatenate((np.ones(mpc.plan.n_p), later))
     H, C = (x.detach().double().numpy() * units for x in (qp.H, qp.C))
     C = C / np.maximum(np.abs(C).max(1, keepdims=True, initial=0.0), TINY)
-    T_v = null_space(C[None], mpc.n_p).T[0][:, mpc.n_p :]
+    T_v = null_space(C[None], mpc.plan.n_p).T[0][:, mpc.plan.n_p :]
     H = units[:, None] * H
     sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
     numbers = {"smallest eigenvalue on the plan": sizes[0], "largest": sizes[-1]}
     ok = bool(sizes[0] > SINGULAR * sizes[-1])
     remedy = _weighted(design, sizes[-1])
     if sizes[0] < -SINGULAR * abs(sizes[-1]):
-        remedy = "Learning has made it indefinite: mpc.reset_parameters(), or learn other parts."
+        remedy = (
+            "Learning has made it indefinite: mpc.plan.reset_parameters(), or learn other parts."
+        )
     return Finding("cost", ok, numbers, remedy * (not ok))
 
 
@@ -252,7 +254,7 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     target = Target(*(part.expand(*stages, -1) for part in rest))
     ahead = np.tile(known, (len(x), mpc.horizon + 1, 1))
     p = mpc.arrange(x, target, u_last=u_last, known=ahead, level=known)
-    status = solve_qp(mpc.quadratic_program(), p, solver="daqp", on_failure="mask").status
+    status = solve_qp(mpc.plan.quadratic_program(), p, solver="daqp", on_failure="mask").status
     hard = design.bounded[0] & np.isinf(design.y_slack)
     names = ", ".join(name for name, x in zip(design.plant.outputs, hard, strict=True) if x)
     numbers: dict[str, Any] = {"hard bounds of": names or "no output"}

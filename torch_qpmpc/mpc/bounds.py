@@ -38,6 +38,8 @@ class Bounds:
             actions are hard and the others soft. Pass one weight, or one per entry; for
             ``constraint_slack`` one per row of D, then of D^f.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
+        held: one bool per row of D: True where a row that holds in a block's first stage holds in
+            the others. By default those of actions alone.
 
     Raises:
         QPError: bounds cross or are NaN, a weight is negative, or shapes do not match.
@@ -59,6 +61,7 @@ class Bounds:
     action_slack: Any = torch.inf
     constraint_slack: Any = 100.0
     discount_slack: bool = False
+    held: Any = None
 
     def __post_init__(self) -> None:
         check_flag("discount_slack", self.discount_slack)
@@ -67,6 +70,13 @@ class Bounds:
             value = getattr(self, name)
             if value is not None or name in SLACKS:
                 object.__setattr__(self, name, read(name, value))
+        if self.held is not None:
+            held = torch.as_tensor(self.held, dtype=torch.bool, device="cpu")
+            n_mixed = 0 if self.constraints is None else len(self.constraints[0])
+            if held.shape != (n_mixed,):
+                want = f"({n_mixed},): one entry per row of constraints"
+                raise QPError.expected("held", f"shape {tuple(held.shape)}", want)
+            object.__setattr__(self, "held", held)
 
     def counted(self, layout: Layout) -> Layout:
         """Return ``layout`` with the numbers of these rows."""

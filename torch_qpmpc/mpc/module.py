@@ -583,11 +583,11 @@ class QPMPC(nn.Module):
     @property
     def constants(self) -> dict[int, float]:
         """The entries of p that have one value only, such as a 1 in the state."""
-        return {}
+        return {**self.scheme.constants}
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The arguments of `QPMPC.of`, without a subclass's own, as tensors and plain values."""
+        """The arguments of `QPMPC.of`, as tensors and plain values."""
         return self.scheme.arguments | self._options()
 
     def __reduce_ex__(self, protocol: Any) -> tuple:

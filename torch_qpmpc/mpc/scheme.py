@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -39,6 +39,7 @@ class Scheme:
         bounds: no bounds by default.
         gamma: discount of the stage costs, 0 < gamma <= 1.
         seed: the seed of random parts.
+        constants: the entries of p that have one value only, such as a 1 in the state, by index.
 
     Raises:
         QPError: a part is of another type, or does not match the sizes; or the cost is not convex.
@@ -60,6 +61,7 @@ class Scheme:
     bounds: Bounds = field(default_factory=Bounds)
     gamma: float = GAMMA
     seed: int = 0
+    constants: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         kinds = {"layout": Layout, "model": Model, "cost": Cost, "bounds": Bounds}
@@ -83,13 +85,14 @@ class Scheme:
         blocks: Sequence[int] = (),
         gamma: float = GAMMA,
         seed: int = 0,
+        constants: Mapping[int, float] | None = None,
         **options: Any,
     ) -> Scheme:
         """Return the scheme of sizes and of the arguments of its parts by name.
 
         Args:
             n_x, n_u, horizon, n_d, blocks: see `Layout`.
-            gamma, seed: see `Scheme`.
+            gamma, seed, constants: see `Scheme`.
             options: the arguments of `Model`, `Cost` and `Bounds`.
 
         Raises:
@@ -102,7 +105,9 @@ class Scheme:
         )
         if options:
             check_names(options, also=())
-        return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed)
+        return cls(
+            layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed, constants or {}
+        )
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -113,6 +118,7 @@ class Scheme:
             **{x.name: getattr(part, x.name) for part in parts for x in fields(part)},
             "gamma": self.gamma,
             "seed": self.seed,
+            "constants": {**self.constants},
         }
 
     @property
@@ -122,7 +128,9 @@ class Scheme:
 
     @property
     def of_actions(self) -> Tensor:
-        """True for the rows of D that bound actions alone, ``(n_mixed,)``."""
+        """True for the rows of D that bound actions alone, or `Bounds.held`, ``(n_mixed,)``."""
+        if self.bounds.held is not None:
+            return self.bounds.held
         if self.bounds.constraints is None:
             return torch.zeros(0, dtype=torch.bool)
         return ~self.bounds.constraints[0][:, : -self.layout.n_u].any(-1)
@@ -178,7 +186,8 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
 def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, "schedule")) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
-    check_keywords("QPMPC", options, own | {"blocks", "gamma", "seed", *SIZES, *also})
+    known = {"blocks", "gamma", "seed", "constants", *SIZES}
+    check_keywords("QPMPC", options, own | known | {*also})
 
 
 def check_keywords(owner: str, options: Iterable[str], known: Iterable[str]) -> None:
