@@ -12,7 +12,7 @@ from torch import Tensor
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.analysis.structure import PredictionForm, prediction_form
 from torch_qpmpc.mpc.layout import banded_matrix
-from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.kernels.batched import multiply
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
@@ -178,17 +178,15 @@ def known_qp(
     )
 
 
-CPU = torch.device("cpu")
-
-
-def programs_of(known: KnownQP, device: torch.device | None = CPU) -> Programs:
-    """Convert a known QP to the pipeline's input: tensors, or NumPy arrays without a device."""
-    return Programs.of(*known.qp.tensors(), known.fixed, device=device)[0]
+def programs_of(known: KnownQP) -> Programs:
+    """Convert a known QP to the pipeline's input."""
+    return Programs.of(*known.qp.tensors(), known.fixed)[0]
 
 
 def reduced_of(known: KnownQP) -> Reduced:
-    """Condense a known QP in tensors, keeping only the fixed entries."""
-    return programs_of(known).prepared.reduced(known.fixed.shape[-1])
+    """Condense a known QP, keeping only the fixed entries; its parts as tensors."""
+    reduced = programs_of(known).prepared.reduced(known.fixed.shape[-1])
+    return Reduced._make(map(to_tensor, reduced))
 
 
 def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
@@ -197,17 +195,18 @@ def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
     v = known.z.reshape(len(programs), -1) - expanded(programs)
     v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
     lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
-    return programs.reduced_qps(), BackendSolution(v, lam, torch.zeros_like(programs.group))
+    steps = torch.zeros(len(programs), dtype=torch.int64)
+    return programs.reduced_qps().in_torch(), BackendSolution(v, lam, steps)
 
 
 def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
     """Expand free variables ``(B, d)``, zero by default, to z ``(B, n_z)``."""
-    reduced = programs.prepared.reduced(programs.n_f)
+    reduced = Reduced._make(map(to_tensor, programs.prepared.reduced(programs.n_f)))
     fixed = to_tensor(programs.fixed)
     if v is None:
         v = fixed.new_zeros(len(programs), reduced.H.shape[-1])
     free = torch.cat((fixed, v), dim=-1)
-    return sample_torch.multiply(reduced.T, programs.group, free) + reduced.z_0
+    return multiply(reduced.T, to_tensor(programs.group), free) + reduced.z_0
 
 
 def solution_of(known: KnownQP) -> dict[str, Tensor]:

@@ -39,7 +39,7 @@ BUDGET = {
     "identification": 1800,
     "mpc": 3489,
     "proofs": 1000,
-    "qp": 5672,
+    "qp": 5560,
     "study": 550,
 }
 #: Libraries that only some layers may import.

@@ -35,7 +35,7 @@ from torch_qpmpc.study.markdown import replaced, table
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 GPU = torch.device("cuda")
-BATCHES = (1, 4_096, 65_536, 262_144)
+BATCHES = (4_096, 65_536, 262_144)
 #: The batch of the comparison, and of the peers' rows: qpax needs more memory.
 LARGE, OF_PEERS = 65_536, 16_384
 ROUNDS = 7
@@ -71,13 +71,11 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
         data = transitions(PAPER.n_x, PAPER.n_u, batch)
         s, a = data.s.to(device), data.a.to(device)
         with torch.no_grad():
-            first = mpc.solve(s)
-            error = relative_error(first.value.cpu(), exact.value(data.s)).max()
+            error = relative_error(mpc.value(s).cpu(), exact.value(data.s)).max()
             if device.type == "cuda":
                 torch.cuda.reset_peak_memory_stats()
             cold = seconds(lambda s=s: mpc.value(s))
             memory = torch.cuda.max_memory_allocated() / 2**20 if device.type == "cuda" else 0
-            warm = seconds(lambda s=s, x=first.active: mpc.solve(s, warm_start=x))
 
         def gradient(value: Callable[[], Tensor]) -> float:
             def run() -> None:
@@ -88,9 +86,9 @@ def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
 
         of_Q = gradient(lambda s=s, a=a: mpc.action_value(s, a))
         of_pi = gradient(lambda s=s: mpc.policy(s))
-        times = (significant(1e6 * x / batch) for x in (cold, warm, of_Q, of_pi))
+        times = (significant(1e6 * x / batch) for x in (cold, of_Q, of_pi))
         lines.append([f"{batch:,}", *times, f"{memory:,.0f}; {error:.0e}"])
-    head = ["batch", "V", "V, warm", "Q and gradient", "policy and gradient"]
+    head = ["batch", "V", "Q and gradient", "policy and gradient"]
     return table([*head, "MiB; error"], lines)
 
 
@@ -179,16 +177,15 @@ def comparison(device: torch.device, count: int = LARGE) -> str:
     mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
     s = transitions(PAPER.n_x, PAPER.n_u, count).s.to(device)
     with torch.no_grad():
-        active = mpc.solve(s).active
-        times = seconds(lambda: mpc.solve(s)), seconds(lambda: mpc.solve(s, warm_start=active))
-    rows: list[tuple[str, int, tuple[float, ...] | list[float]]] = []
-    rows.append(("torch, on the GPU", count, times))
+        times = [seconds(lambda: mpc.solve(s))]
+    rows: list[tuple[str, int, list[float]]] = []
+    rows.append(("torch, GPU", count, times))
     cores = os.cpu_count() or 1
-    rows.append(("daqp, on one core", count, on_cores(1, count)))
-    rows.append((f"daqp, on {cores} cores", count, on_cores(cores, count)))
+    rows.append(("daqp, one core", count, on_cores(1, count)))
+    rows.append((f"daqp, {cores} cores", count, on_cores(cores, count)))
     for name, of in {"qpax": by_qpax, "Moreau": by_moreau}.items():
         if (peer := of(min(count, OF_PEERS))) is not None:
-            label = f"{name}, on the GPU (error {peer[1]:.0e})"
+            label = f"{name}, GPU (error {peer[1]:.0e})"
             rows.append((label, min(count, OF_PEERS), [peer[0]]))
     lines = [
         [name, f"{batch:,}", *(significant(1e6 * x / batch) for x in each), *[""] * (2 - len(each))]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, times
 from torch_qpmpc import QuadraticProgram, Status
 
 #: Tolerance of a value, relative to the terms of the Lagrangian (see `tests.campaign.outcomes`).
@@ -41,7 +41,10 @@ class Draw(random.Random):
         return 10 ** (low + (high - low) * exponent)
 
     def known(self, count: int, **options: Any) -> KnownQP:
-        """Draw a batch of QPs of any size, with shared or separate matrices and few hard rows."""
+        """Draw a batch of QPs of any size, with shared or separate matrices and few hard rows.
+
+        One in four has large numbers for absent bounds, one in four rows in lengths of their own.
+        """
         n_z = self.randint(3, 14)
         n_f = self.randint(0, min(4, n_z - 2))
         n_c = self.randint(0, (n_z - n_f) // 2)
@@ -55,7 +58,30 @@ class Draw(random.Random):
             "hard": self.rows(HARD_ROWS, 0, (n_z - n_f - n_c) // 2),
             "weight": 10 ** self.uniform(-1, 2),
         }
-        return known_qp(self.getrandbits(32), **(settings | options))
+        known = known_qp(self.getrandbits(32), **(settings | options))
+        known = self.far(known) if self.random() < 0.25 else known
+        return self.in_lengths(known) if self.random() < 0.25 else known
+
+    def far(self, known: KnownQP) -> KnownQP:
+        """Move bounds that are absent or not active to between 1e3 and 1e20 from zero."""
+        qp = known.qp
+        y, share = times(qp.G, known.z), self.choice([0.5, 1.0])
+        size = torch.maximum(y.abs(), torch.ones_like(y))
+        for name, sign in (("lb", -1.0), ("ub", 1.0)):
+            bound = getattr(qp, name)
+            free = (sign * (bound - y) > 0.05) & (sign * known.lam <= 0)
+            drawn = torch.rand(y.shape, generator=self.generator) < share
+            far = sign * size * self.powers(3, 20, *y.shape)
+            known = changed(known, **{name: torch.where(free & drawn, far.to(bound), bound)})
+        return known
+
+    def in_lengths(self, known: KnownQP) -> KnownQP:
+        """Multiply each row of G by a factor of its own, between 1e-6 and 1e6."""
+        qp = known.qp
+        factor = self.powers(-6, 6, qp.G.shape[-2]).to(qp.G)
+        rows = {"lb": factor * qp.lb, "ub": factor * qp.ub, "w": qp.w / factor}
+        known = changed(known, G=factor[:, None] * qp.G, **rows)
+        return replace(known, sigma=factor * known.sigma, lam=known.lam / factor)
 
     def rows(self, kinds: tuple[str, ...], least: int, most: int) -> tuple[str, ...]:
         return tuple(self.choices(kinds, k=self.randint(least, most)))

@@ -245,3 +245,28 @@ def test_the_target_has_a_gradient(inputs):
     assert out_of_reach.grad is not None
     assert out_of_reach.grad.abs().max() < 1e-9
     assert not mpc.target([1.0]).u.requires_grad
+
+
+@pytest.mark.parametrize("far", [1e8, 1e14, 1e20])
+@pytest.mark.parametrize("side", ["y_bounds", "u_bounds", "both"])
+def test_bounds_that_cannot_act_change_neither_weight_nor_input(side, far):
+    """A large number in place of an infinite bound once cost the Riccati weight."""
+    names = ("y_bounds", "u_bounds") if side == "both" else (side,)
+    plain, bounded = (
+        qm.Controller(qm.LinearMPC(SCALAR, 8, Q=1.0, dR=0.1, **dict.fromkeys(names, (-x, x))))
+        for x in (np.inf, far)
+    )
+    assert riccati(bounded.mpc.design) is not None
+    for controller in (plain, bounded):
+        controller.reset(y=[0.0], u=[0.0])
+    for y in (0.0, 0.3, 0.5):
+        inputs = (controller.step([y], r=[1.0]) for controller in (plain, bounded))
+        np.testing.assert_allclose(*inputs, rtol=1e-6)
+
+
+def test_outputs_in_any_units_have_a_symmetric_weight():
+    rng, unit = np.random.default_rng(3), 10 ** np.array([-5.0, 0.0, 5.0])
+    A, B, C = 0.5 * np.eye(4), rng.normal(size=(4, 2)), unit[:, None] * rng.normal(size=(3, 4))
+    mpc = qm.LinearMPC((A, B, C), 12, Q=np.diag(1 / unit**2), dR=0.1, u_bounds=(-1, 1))
+    H = mpc.plan.quadratic_program().H
+    assert torch.equal(H, H.mT)

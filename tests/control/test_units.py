@@ -113,5 +113,5 @@ def test_a_target_whose_value_is_the_rest_of_huge_terms_is_exported(tmp_path, se
 def test_the_rows_of_an_export_depend_on_each_other_alike_in_any_unit(seed):
     design, units = drawn(seed)
     one = Units(*(np.ones(len(unit)) for unit in units))
-    Q, other = (make_tables(design.made(x)).Q for x in (one, units))
+    Q, other = (make_tables(design.made(x).plan).Q for x in (one, units))
     assert np.abs(Q - other).max() < 1e-10

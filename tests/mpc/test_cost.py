@@ -56,3 +56,14 @@ def test_a_scheme_refuses_a_cost_that_does_not_fit(arguments, message):
     cost = Cost(**({"stage_weight": [1.0, 1.0, 0.1]} | arguments))
     with pytest.raises(QPError, match=f"^{message}"):
         Scheme(LAYOUT, MODEL, cost)
+
+
+def test_an_asymmetry_is_relative_to_its_row_and_column():
+    """Rounding beside 1e10 is none, and 1e-3 of an entry of 1e-9 is one."""
+    weight = torch.tensor([[1e10, 1e3, 0.0], [1e3, 1e-3, 0.0], [0.0, 0.0, 1.0]]).double()
+    slight, wrong = weight.clone(), 1e-9 * torch.eye(3).double()
+    slight[0, 1] += 1e-6
+    wrong[0, 1] = 1e-12
+    Scheme(LAYOUT, MODEL, Cost(slight, hessian="block"))
+    with pytest.raises(QPError, match=r"^stage_weight: got asymmetry 1e-12"):
+        Scheme(LAYOUT, MODEL, Cost(wrong, hessian="block"))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import CPU, KnownQP, known_qp, normal, programs_of, random_mpc, random_states
+from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
 from torch_qpmpc import QPError, QuadraticProgram, solve_qp
 from torch_qpmpc.qp import kkt
 from torch_qpmpc.qp.program import EVENT_SHAPES
@@ -496,18 +496,6 @@ def test_the_schur_complement_gives_the_gradients_of_the_whole_system(matrices, 
     monkeypatch.setattr(kkt, "PASSES", 0)
     for mine, other, size in zip(ours, gradients(), sizes, strict=True):
         assert_close(size * mine, size * other, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.parametrize("matrices", [(), (6,)])
-def test_the_adjoint_in_tensors_is_that_in_arrays(matrices):
-    """Run the other devices' path on the CPU."""
-    known = known_qp(5, batch=(6,), matrices=matrices, soft=KINDS, hard=("inside", "at_upper"))
-    solution = known.z, known.lam, known.chi, known.fixed
-    z, lam, chi, xi = (normal(*x.shape, seed=i) for i, x in enumerate(solution))
-    both = (programs_of(known, device) for device in (None, CPU))
-    ours, others = (kkt._solve_kkt(p, z, lam, chi, xi, known.z, known.lam) for p in both)
-    for one, other in zip(ours, others, strict=True):
-        assert_close(one, other, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("size", [1e-15, 1.0, 1e15])

@@ -141,7 +141,7 @@ class Design:
         costly = weights > 0
         by_weight = np.where(costly, 1 / np.sqrt(np.where(costly, weights, 1.0)), self.scaling.y)
         half = ranges(self.y_bounds)
-        return np.where(half > 0, half, by_weight)
+        return np.where((half > 0) & (half <= self.scaling.y), half, by_weight)
 
     @cached_property
     def scaling(self) -> Scaling:

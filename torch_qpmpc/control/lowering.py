@@ -79,7 +79,7 @@ def _cost(design: Design, layout: Layout) -> Cost:
     u[: len(s["u_r"])] -= s["u_r"]
     du = [s["u"] - s["u_last"]] if design.moves else []
     T = np.vstack((y, u, *du))
-    stage = 2 * T.T @ block_diag(design.Q, design.R, *[design.dR] * len(du)) @ T
+    stage = _squares(T, block_diag(design.Q, design.R, *[design.dR] * len(du)))
     linear = np.zeros(len(stage))
     for name, price in design.linear.items():
         i = places["u"].start + plant.inputs.index(name)
@@ -94,9 +94,15 @@ def _cost(design: Design, layout: Layout) -> Cost:
     size = places["u"].start
     P = riccati(design)
     x = np.vstack((s["x"], s["u_last"]))[:, :size]
-    terminal = 2 * y[:, :size].T @ design.Q @ y[:, :size] if P is None else x.T @ P @ x
+    terminal = _squares(y[:, :size], design.Q) if P is None else _squares(x, P / 2)
     q = layout.from_stage(torch.as_tensor(linear).expand(layout.horizon, 1, -1)).sum(0)
     return Cost(stage, terminal, hessian="block", q=q)
+
+
+def _squares(T: Array, weight: Array) -> Array:
+    """Return ``2 T' weight T``, whose rounding is asymmetric, made symmetric."""
+    half = T.T @ weight @ T
+    return half + half.T
 
 
 def riccati(design: Design) -> Array | None:
@@ -184,7 +190,7 @@ def target_mpc(design: Design) -> QPMPC:
     # y_s - r and u_s as maps of [r; w; d; 1; v].
     error = np.hstack((-np.eye(n_y), steady.y, steady.Y))
     inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u, steady.U))
-    weight = 2 * error.T @ design.Q @ error
+    weight = _squares(error, design.Q)
     if len(steady.W) and not split:
         weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
     y, u, _, d = design.scaling

@@ -15,6 +15,8 @@ from torch_qpmpc.control.state_space import Array, StateSpace
 STEPS = 20
 #: Weight of outputs beside an input that is at rest with them: it decides for integrators.
 FAINT = 1e-6
+#: A bound this many times further away than a signal's other sizes does not act.
+FAR = 1e6
 Bounds = tuple[Array, Array]
 
 
@@ -55,8 +57,11 @@ class Scaling(NamedTuple):
             np.zeros(k) if b is None else ranges(b) for k, b in ((n_y, y_bounds), (m, u_bounds))
         )
         weight = np.zeros(n_y) if Q is None else np.sqrt(np.diag(Q))
+        u = _within(u, _inverse((Y * weight[:, None]).max(0)))
+        y = _within(y, np.maximum((Y * u).max(1, initial=0.0), _inverse(weight)))
         aimed = _first(y, (Y * u).max(1, initial=0.0), _inverse(weight))
-        u = _first(u, _inverse((Y * _inverse(aimed)[:, None]).max(0)), _inverse(Y.max(0)))
+        aiming = _inverse((Y * _inverse(aimed)[:, None]).max(0))
+        u = _first(u, aiming, _inverse(Y.max(0)))
         u = _first(u, _inverse(X.max(0)), np.ones(m))
         y = _first(y, (Y * u).max(1, initial=0.0), aimed, np.ones(n_y))
         moved = (X * u).max(1, initial=0.0)
@@ -101,9 +106,14 @@ class Scaling(NamedTuple):
 
 
 def ranges(bounds: Bounds) -> Array:
-    """Return half the distance of the bounds, and zero where there is none."""
-    half = (bounds[1] - bounds[0]) / 2
-    return np.where(np.isfinite(half) & (half > 0), half, 0.0)
+    """Return half the distance of the bounds, and zero where there is none, or one is far away."""
+    half, near = (bounds[1] - bounds[0]) / 2, np.minimum(*np.abs(bounds))
+    return _within(np.where(np.isfinite(half) & (half > 0), half, 0.0), near)
+
+
+def _within(sizes: Array, others: Array) -> Array:
+    """Return the sizes, and zero where they exceed other ones more than `FAR` times."""
+    return np.where((others > 0) & (sizes > FAR * others), 0.0, sizes)
 
 
 def _first(*sizes: Array) -> Array:

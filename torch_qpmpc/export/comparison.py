@@ -243,7 +243,8 @@ def _tolerance(tables: Tables, dtype: str, p: Array, lam: Array) -> float:
         float(CONSTANTS[dtype][key].rstrip("f")) for key in ("TOLERANCE", "ROUNDING")
     )
     held = (lam != 0) & (np.abs(lam) < tables.rows.w)
-    size = tables.rows.size + np.abs(tables.rows.Y) @ np.abs(p)
+    bound = np.where(lam > 0, tables.rows.upper, tables.rows.lower)
+    size = tables.rows.size + np.abs(tables.rows.Y) @ np.abs(p) + np.abs(bound)
     error = tight * size[held] + rounding * np.abs(lam).sum()
     gain = np.linalg.lstsq(tables.Q[np.ix_(held, held)], tables.F[:, held].T, rcond=None)[0]
     return float((error @ np.abs(gain)).max(initial=0))

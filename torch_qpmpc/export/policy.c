@@ -103,6 +103,13 @@ static real bound(const policy_state *s, int row)
     return s->kind[row] > 0 ? Y_UPPER[row] : Y_LOWER[row];
 }
 
+/* Return the size of the terms that a row compares with its bound on a side; the other one, which
+   may be far away, has no part in it. */
+static real terms_of(const policy_state *s, int row, real side)
+{
+    return s->size[row] + absolute(side > 0 ? Y_UPPER[row] : Y_LOWER[row]);
+}
+
 /* Return the ends of the interval of a row's multiplier; equal bounds hold it on both sides. */
 static real lowest(int row, int side)
 {
@@ -271,7 +278,7 @@ static int hold(policy_state *s, int row, int side, real excess, int *iterations
         step = longest(s, x, NOISE, most, &at, &end);
         if (step >= BIG) {
             s->kind[row] = IGNORED;
-            return absolute(excess) <= FEASIBLE * s->size[row];
+            return absolute(excess) <= FEASIBLE * terms_of(s, row, excess);
         }
         move(s, x, step);
         s->lambda[row] += sign * step;
@@ -304,7 +311,7 @@ static int worst(const policy_state *s, real tolerance, int *side, real *excess,
         else if (kind == -SATURATED) off = larger(below, 0);
         else if (kind != IGNORED) off = kind > 0 ? above : below;
         size = absolute(off);
-        if (size <= tolerance * s->size[i] + ROUNDING * sum) continue;
+        if (size <= tolerance * terms_of(s, i, kind ? kind : off) + ROUNDING * sum) continue;
         if (kind == HELD || kind == -HELD) {
             *settled = 0;
             continue;
@@ -361,7 +368,7 @@ static int certify(const policy_state *s, real v_free, policy_info *info)
         real charge = W[i] < BIG ? W[i] * off : 0;
         if (W[i] >= BIG) {
             info->violation = larger(info->violation, off * UNIT[i]);
-            if (!(off <= FEASIBLE * s->size[i] + ROUNDING * sum)) holds = 0;
+            if (!(off <= FEASIBLE * terms_of(s, i, y - Y_UPPER[i]) + ROUNDING * sum)) holds = 0;
         }
         if (lambda != 0) {
             real at = lambda > 0 ? Y_UPPER[i] : Y_LOWER[i];

@@ -21,7 +21,7 @@ from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
 from torch_qpmpc.qp.pipeline.scaling import ROUNDING, lengths
-from torch_qpmpc.qp.program import EVENT_SHAPES, QuadraticProgram, Status, crossed
+from torch_qpmpc.qp.program import EVENT_SHAPES, INFINITE, QuadraticProgram, Status, crossed
 from torch_qpmpc.qp.solve import solve_qp
 
 #: H_v is singular if its smallest eigenvalue is below this fraction of the largest.
@@ -41,7 +41,7 @@ class Rows:
     Attributes:
         Y: ``(r, n_p)``, y without multipliers is ``Y p``.
         lower, upper, w: ``(r,)``, infinite where there is no bound or the row is hard.
-        size: ``(r,)``, the size of the terms of y that do not depend on p.
+        size: ``(r,)``, the size of the terms of y that do not depend on p or multipliers.
         unit: ``(r,)``, y in the units of G's row is ``unit`` times that of the table.
     """
 
@@ -116,6 +116,7 @@ def make_tables(mpc: QPMPC) -> Tables:
     _check(qp)
     n_p, n_u = mpc.n_p, mpc.n_u
     H = (H + H.T) / 2
+    lb, ub = np.where(lb <= -INFINITE, -np.inf, lb), np.where(ub >= INFINITE, np.inf, ub)
     # In units of the free entries of z that equilibrate H, C and G; p, u_0 and y keep their own.
     # Rows of C are scaled by their free entries: those of p may be in any unit.
     units = lengths(H[None], np.concatenate((C, G))[None])[0]
@@ -215,9 +216,8 @@ def _solve(factor: Array, right: Array) -> Array:
 def _rows(Y: Array, y_0: Array, unit: Array | float, lb: Array, ub: Array, w: Array) -> Rows:
     unit = np.broadcast_to(unit, y_0.shape)
     upper = np.maximum(lb, ub)  # bounds that cross by rounding are equal
-    near = np.minimum(*(np.where(np.isfinite(x), np.abs(x), np.inf) for x in (lb, upper)))
-    size = (np.abs(y_0) + near) / unit
-    return Rows(Y / unit[:, None], (lb - y_0) / unit, (upper - y_0) / unit, w * unit, size, unit)
+    ends, size = ((x - y_0) / unit for x in (lb, upper)), np.abs(y_0) / unit
+    return Rows(Y / unit[:, None], *ends, w * unit, size, unit)
 
 
 def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:

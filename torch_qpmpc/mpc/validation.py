@@ -17,6 +17,8 @@ from torch_qpmpc.qp.batching import broadcast, to_dtype
 
 P = ParamSpec("P")
 T = TypeVar("T")
+#: Largest asymmetry of a weight's entry, relative to its row and column.
+ASYMMETRY = 1e-5
 #: In order, from the least tied to the most.
 STRUCTURES = ("free", "varying", "tied")
 #: The parts of theta by family; the paper advises a different learning rate for each.
@@ -123,13 +125,16 @@ def read_numbers(name: str, value: Any) -> Tensor:
 def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
     """Raise `QPError` unless a weight, or its diagonal, is symmetric positive semidefinite.
 
-    The block of the first n_d entries and its cross block may be any.
+    An entry's asymmetry is relative to the largest of its row and of its column. The block of the
+    first n_d entries and its cross block may be any.
     """
-    if not diagonal and not torch.allclose(weight, weight.mT):
-        asymmetry = (weight - weight.mT).abs().max()
-        raise QPError.expected(
-            name, f"asymmetry {asymmetry:.3g}", "a symmetric matrix", "Pass (W + W.mT) / 2."
-        )
+    if not diagonal and weight.numel():
+        asymmetry, size = (weight - weight.mT).abs(), weight.abs().amax(-1).sqrt()
+        size = torch.maximum(size, weight.mT.abs().amax(-1).sqrt())
+        limit = ASYMMETRY * size.unsqueeze(-1) * size.unsqueeze(-2)
+        if not (asymmetry <= limit).all():
+            got = f"asymmetry {asymmetry.max():.3g}"
+            raise QPError.expected(name, got, "a symmetric matrix", "Pass (W + W.mT) / 2.")
     eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight[..., n_d:, n_d:])
     if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
         got = f"smallest eigenvalue {eigenvalues.min():.3g}"

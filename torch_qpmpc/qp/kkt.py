@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, broadcast, flatten_batch, schema, times
-from torch_qpmpc.qp.kernels.sample_torch import hold, largest, multiply
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, native_device, to_numpy, to_tensor
+from torch_qpmpc.qp.kernels.batched import hold, largest, multiply
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, Status
 from torch_qpmpc.qp.solution import active_rows
@@ -46,24 +45,25 @@ def kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def solve_kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Solve the KKT system in condensed form for the whole batch at once.
+    """Solve the KKT system in condensed form for the whole batch at once, on the CPU.
 
     Returns p ``(*batch, n_z)``, r ``(*batch, n_c)``, t ``(*batch, n_g)`` and u ``(*batch, n_f)``.
 
     The ``arguments`` are the gradients in z, lam, chi and xi; z, lam, status; H, .., fixed; and
     n_kept of `Programs.of`. The gradients of unsolved elements are zero.
     """
-    grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, fixed, n_kept = arguments
+    *tensors, n_kept = arguments
+    grad_z, grad_lam, grad_chi, grad_xi, z, lam, status, *theta, fixed = (x.cpu() for x in tensors)
     # Under vmap the gradients may have batch dimensions that the QP lacks.
     vectors = (grad_z, grad_lam, grad_chi, grad_xi, z, lam, fixed)
     batch = broadcast(*(x.shape[:-1] for x in vectors), status.shape)
     fixed = fixed.expand(*batch, fixed.shape[-1])
-    programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=native_device(z))
+    programs, batch = Programs.of(*theta, fixed, n_kept=n_kept)
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
     which, solvable = slice(None), programs
     if not solved.all():
         which = solved.nonzero().squeeze(-1)
-        solvable = programs.take(which.numpy(force=True))
+        solvable = programs.take(which.numpy())
 
     def flat(x: Tensor) -> Tensor:
         return flatten_batch(x.expand(*batch, x.shape[-1]))[which].double()
@@ -74,7 +74,8 @@ def solve_kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in like)
     for x, solution in zip(results, solutions, strict=False):
         x[which] = solution.to(x)
-    p, r, t, u = (x.reshape(*batch, x.shape[-1]) for x in results)
+    like = tensors[4]
+    p, r, t, u = (x.reshape(*batch, x.shape[-1]).to(like.device) for x in results)
     return p, r, t, u
 
 
@@ -82,10 +83,8 @@ def _solve_kkt(
     programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam
 ) -> tuple[Tensor, ...]:
     n_f, theta = programs.n_f, programs.prepared.theta
-    tensor = partial(torch.as_tensor, device=z.device)
-    group = tensor(programs.group)
-    H, C, G = tensor(theta.H), tensor(theta.C), tensor(theta.G)
-    T, Y_neg, H_y, G_y, _, _ = map(tensor, programs.prepared.condensed(n_f).arrays)
+    group, H, C, G = map(to_tensor, (programs.group, theta.H, theta.C, theta.G))
+    T, Y_neg, H_y, G_y, _, _ = map(to_tensor, programs.prepared.condensed(n_f).arrays)
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
@@ -109,23 +108,20 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     They are those of `active_rows`, and those that `implied_equalities` adds; rows without a free
     variable have no part in the KKT system.
     """
-    tensor = partial(torch.as_tensor, device=y.device)
-    lb, ub, w = map(tensor, programs.theta[6:9])
+    lb, ub, w = map(to_tensor, programs.theta[6:9])
     if (units := programs.prepared.units) is not None:  # zero and equal are relative to these
-        rows, cost = tensor(units.rows)[programs.group], tensor(units.cost)[programs.group]
+        rows, cost = (to_tensor(x)[programs.group] for x in (units.rows, units.cost))
         y, lb, ub, lam, w = y / rows, lb / rows, ub / rows, lam * (rows / cost), w * (rows / cost)
     held, saturated = active_rows(lam, lb, ub, w)
     condensed = programs.prepared.condensed(programs.n_f)
-    entering = tensor(condensed.enters[:, programs.n_f :].any(-1))
+    entering = to_tensor(condensed.enters[:, programs.n_f :].any(-1))
     near, free = AT_BOUND * (1 + y.abs()), ~(held | saturated) & entering
     held &= entering
     lower, upper = free & (y - lb <= near), free & (ub - y <= near)
     if (weak := (lower | upper).any(-1)).any():
-        index = to_numpy(weak.nonzero().squeeze(-1))
         G = condensed.arrays.G[:, :, programs.n_f :]
-        masks = (to_numpy(x)[index] for x in (lower, upper, held))
-        implied = _all_implied(G, to_numpy(programs.group)[index], *masks)
-        held[weak] |= torch.from_numpy(implied).to(held.device)
+        masks = (x[weak].numpy() for x in (lower, upper, held))
+        held[weak] |= torch.from_numpy(_all_implied(G, programs.group[weak.numpy()], *masks))
     return held
 
 
@@ -183,7 +179,7 @@ def _solve_active(
     H is factorised once for each theta, and the Schur complement of the active rows for each QP,
     unless every QP has a theta of its own.
     """
-    group = torch.as_tensor(programs.group, device=H.device)
+    group = to_tensor(programs.group)
     if 1 < len(H) == len(group):
         return _solve_dense(H[group], G[group], active, right_v, right_t)
     to_g, to_lam = map(to_tensor, programs.prepared.sensitivities(programs.n_f))
@@ -193,7 +189,7 @@ def _solve_active(
     regular = size < 0
     for _ in range(PASSES):
         free = multiply(to_g.mT, group, of_v)
-        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows], passes=1)
+        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows])
         dv = vy[:, : v.shape[-1]]
         v, t = v + dv, t.index_add(1, rows, dt)
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)

@@ -101,8 +101,9 @@ class QuadraticProgram:
         C: equality matrix, ``(*batch, n_c, n_z)``.
         b: equality right-hand side, ``(*batch, n_c)``.
         G: inequality matrix, ``(*batch, n_g, n_z)``.
-        lb: lower bounds, ``(*batch, n_g)``; ``-inf`` where there is none.
-        ub: upper bounds, ``(*batch, n_g)``; ``inf`` where there is none.
+        lb: lower bounds, ``(*batch, n_g)``; ``-inf``, or -1e20 and less, where there is none.
+        ub: upper bounds, ``(*batch, n_g)``; ``inf``, or 1e20 and more, where there is none.
+            Smaller bounds count, and cost no accuracy where they are far from the solution.
         w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
         check_values: also check the values (finite, H symmetric and positive semidefinite,
             lb <= ub, w >= 0). `QPMPC` passes ``False``: its parametrisations guarantee them, and
@@ -246,6 +247,8 @@ class QuadraticProgram:
 #: The code of every row in the active set of an unsolved QP.
 UNKNOWN = 127
 
+#: An upper bound of this size, or a lower one of minus this, counts as infinite.
+INFINITE = 1e20
 #: Bounds that cross by at most this many machine epsilons are equal.
 CROSSING = 4.0
 

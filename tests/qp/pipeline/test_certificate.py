@@ -11,8 +11,10 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
 from torch_qpmpc import QuadraticProgram
+from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.device import on_device
 
 BATCH, SPOILT = 5, 2
 N_Z, N_C, N_F = 12, 3, 2
@@ -34,7 +36,7 @@ def judge(known: KnownQP, **claim: Tensor) -> Certificate:
     """Certify the exact solution with the changes in ``claim``."""
     exact = {"z": known.z, "lam": known.lam, "chi": known.chi, "xi": known.xi}
     parts = exact | claim
-    return certify(programs_of(known, None), parts["z"], parts["lam"], parts["chi"], parts["xi"])
+    return certify(programs_of(known), parts["z"], parts["lam"], parts["chi"], parts["xi"])
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
@@ -104,7 +106,7 @@ def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Cert
     changed = replace(
         known, qp=replace(known.qp, q=q, b=times(C, z), lb=lb, ub=ub), fixed=z[:, :N_F]
     )
-    return certify(programs_of(changed, None), z, lam, known.chi, known.xi)
+    return certify(programs_of(changed), z, lam, known.chi, known.xi)
 
 
 def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
@@ -303,3 +305,37 @@ def test_rows_that_agree_up_to_the_rounding_of_the_larger_bound_the_error(least,
 
 def test_rows_that_disagree_leave_the_error_without_a_bound():
     assert bounded_by_both(54.5 + 1e-11).value_error.item() == torch.inf
+
+
+# Each judge of the same rows
+
+
+def vector(*entries: float) -> Tensor:
+    return torch.tensor(entries, dtype=torch.float64)
+
+
+#: Violations relative to the terms of the row, and whether they are too large.
+VIOLATIONS = [(3e-8, True), (3e-5, False)]
+
+
+@pytest.mark.parametrize(("off", "right"), VIOLATIONS)
+@pytest.mark.parametrize("low", [-torch.inf, -1e6, -1e19])
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
+def test_the_certificates_judge_a_row_alike(low, length, off, right):
+    """Of z_1 <= 0.5 beside z_2 <= 1e6, both in lengths, a solution is beyond its bound."""
+    one, inf = torch.eye(2).double(), torch.full((2,), torch.inf).double()
+    G, ub = torch.diag(vector(length, 1.0)), vector(0.5 * length, 1e6)
+    q, lb, none = vector(-1.0, 0.0), torch.full((2,), low).double(), one[:0]
+    qp = QuadraticProgram(one, q, q[1], none, none[:, 0], G, lb, ub, inf)
+    z = vector(0.5 * (1 + off), 0.0)[None]
+    lam = (1 - z) / length * one[:1]
+    plain = Programs.of(*qp.tensors(), z[:, :0])[0]
+    programs, units = plain.scaled(), plain.prepared.units
+    if units is not None:
+        z, lam = z / torch.as_tensor(units.length), lam * torch.as_tensor(units.rows / units.cost)
+    claim = z, lam, z[:, :0], z[:, :0]
+    residual = programs.certify(*(x.numpy() for x in claim))[1]
+    rest = (torch.from_numpy(x) for x in (programs.group, programs.fixed))
+    of_torch = sample_torch.certify(*claim, *rest, *on_device(programs, torch.device("cpu")))[1]
+    assert (residual[0] <= TOLERANCE) == right
+    assert (of_torch[0] <= TOLERANCE) == right

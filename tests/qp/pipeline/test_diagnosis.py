@@ -135,7 +135,7 @@ def doubles(entries) -> Tensor:
 @pytest.mark.parametrize("weight", [1e-2, 5.0, 1e4])
 def test_solvable_programs_are_neither_infeasible_nor_unbounded(rank, weight):
     options = {"rank": rank, "weight": weight, "soft": SOFT_ROWS, "hard": HARD_ROWS}
-    status = diagnose(programs_of(known_qp(1, batch=(4,), **options), None))
+    status = diagnose(programs_of(known_qp(1, batch=(4,), **options)))
     assert (status == Status.NOT_CONVERGED).all()
 
 

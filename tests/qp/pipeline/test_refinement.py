@@ -92,7 +92,7 @@ def test_products_with_infinite_numbers_have_no_value():
 @pytest.mark.parametrize("off", [0.0, 1e-6, 1e-3])
 def test_a_solution_that_is_nearly_right_becomes_exact(off, monkeypatch):
     known = known_qp(3, batch=(6,))
-    p = programs_of(known, None)
+    p = programs_of(known)
     solution = solve_programs(p, "daqp")
     generator = np.random.default_rng(0)
     for part in (solution.z, solution.lam):
@@ -100,10 +100,11 @@ def test_a_solution_that_is_nearly_right_becomes_exact(off, monkeypatch):
     candidate = solution.at(np.arange(6))
     with monkeypatch.context() as patch:  # a large QP waits for the other ways to fail
         patch.setattr(refinement, "MAX_WORK", 1)
-        assert refine(p, solution, np.arange(6)).tolist() == [*range(6)]
+        refine(p, solution, np.arange(6))
         assert (solution.z == candidate.z).all()
-        assert len(refine(p, candidate, np.arange(6), last=True)) == 0
-    assert len(refine(p, solution, np.arange(6))) == 0
+        refine(p, candidate, np.arange(6), last=True)
+        assert candidate.residual.max() < 1e-14
+    refine(p, solution, np.arange(6))
     assert_close(solution.value, known.value.numpy(), rtol=1e-12, atol=1e-12)
     assert_close(solution.z, known.z.numpy(), rtol=1e-9, atol=1e-9)
     assert_close(solution.lam, known.lam.numpy(), rtol=1e-9, atol=1e-9)
@@ -112,7 +113,7 @@ def test_a_solution_that_is_nearly_right_becomes_exact(off, monkeypatch):
 
 def test_only_the_chosen_solutions_change():
     known = known_qp(3, batch=(6,))
-    p = programs_of(known, None)
+    p = programs_of(known)
     solution = solve_programs(p, "daqp")
     before = solution.at(np.arange(6))
     solution.z[2] += 1e-4
@@ -127,9 +128,9 @@ def test_what_has_no_solution_is_left_as_it_was():
     b = known.qp.b.clone()
     C = torch.cat((known.qp.C, known.qp.C[..., :1, :]), dim=-2)
     qp = replace(known.qp, C=C, b=torch.cat((b, b[..., :1] + 1), dim=-1))
-    solution = solve_programs(programs_of(known, None), "daqp")
+    solution = solve_programs(programs_of(known), "daqp")
     chi = np.pad(solution.chi, ((0, 0), (0, 1)))
-    p = programs_of(replace(known, qp=qp), None)
+    p = programs_of(replace(known, qp=qp))
     candidate = solution._replace(chi=chi)
-    assert refine(p, candidate, np.arange(2)).tolist() == [0, 1]
+    refine(p, candidate, np.arange(2))
     assert_close(candidate.z, solution.z, rtol=0, atol=0)

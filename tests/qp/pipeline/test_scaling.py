@@ -1,17 +1,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from torch.testing import assert_close
 
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of
-from torch_qpmpc import QPMPC, SolveLog, Status, solve_qp
+from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
+from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import FEW
+from torch_qpmpc.qp.solution import QPSolution
 
 BATCH = 4
 
@@ -91,3 +95,90 @@ def test_retries_exclude_the_matrices_of_invalid_qps(solver):
     solution = solve_qp(three, s, solver=solver, on_failure="mask")
     assert solution.status.tolist() == [0, Status.INVALID_DATA, 0]
     assert_close(solution.value[[0, 2]], torch.tensor([2.28345503, 0.05404678]).double())
+
+
+# Bounds that cannot act, rows in lengths of their own, and rows that oppose each other
+
+SIZES = [(12, 30, 2), (7, 9, 0), (15, 40, 4)]
+
+
+def one_sided(seed: int, low: float, opposed: float | None = None, factor: Any = 1.0) -> dict:
+    """Draw upper bounds of rows that a point meets; the second row opposes the first by a gap."""
+    n, m, n_c = SIZES[seed % len(SIZES)]
+    rng = np.random.default_rng(100 + seed)
+    L, q, z = rng.normal(size=(n, n)), 2 * rng.normal(size=n), rng.normal(size=n)
+    C, G = rng.normal(size=(n_c, n)), rng.normal(size=(m, n))
+    ub = G @ z + rng.uniform(0.1, 2, m)
+    if opposed is not None:
+        G[1], ub[1] = -G[0], -ub[0] - opposed
+    factor = np.broadcast_to(factor, m)
+    H = L @ L.T / n + 1e-2 * np.eye(n)
+    data = H, q, 0.0, C, C @ z, factor[:, None] * G, np.full(m, low), factor * ub
+    return dict(
+        zip(["H", "q", "c", "C", "b", "G", "lb", "ub"], map(torch.as_tensor, data), strict=True)
+    )
+
+
+def solved(solver: str, w: float = torch.inf, **data: Tensor) -> tuple[QPSolution, float]:
+    """Solve with hard rows; return the largest violation, relative to the terms of its row."""
+    data = {name: x.double() for name, x in data.items()}
+    qp = QuadraticProgram(**data, w=torch.full_like(data["ub"], w))
+    solution = solve_qp(qp, solver=solver, on_failure="mask")
+    over = qp.G @ solution.z - qp.ub
+    terms = qp.G.abs() @ solution.z.abs() + qp.ub.abs()
+    return solution, float((over / terms).max())
+
+
+@pytest.mark.parametrize("low", [-1e4, -1e7, -3e11, -1e16, -1e19, -1e25])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bound_that_cannot_act_costs_nothing(solver, seed, low):
+    expected, _ = solved(solver, **one_sided(seed, -torch.inf))
+    solution, violation = solved(solver, **one_sided(seed, low))
+    assert solution.solved
+    assert violation <= TOLERANCE
+    assert_close(solution.z, expected.z, rtol=0, atol=1e-6)
+    assert_close(solution.value, expected.value, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("low", [-torch.inf, -1e6, -1e18])
+@pytest.mark.parametrize(
+    ("gap", "status"),
+    [
+        (-0.1, Status.SOLVED),
+        (1e-8, Status.SOLVED),
+        (1e-4, Status.INFEASIBLE),
+        (0.3, Status.INFEASIBLE),
+    ],
+)
+def test_rows_that_oppose_each_other_have_one_verdict(solver, low, gap, status):
+    for seed in range(3):
+        solution, violation = solved(solver, **one_sided(seed, low, gap))
+        assert solution.status == status
+        assert violation <= 1e-7 or status
+
+
+def test_rows_of_any_length_are_judged_by_their_own(solver):
+    """Lengths from 1e-6 to 1e6 and bounds of -1e15 in one QP change neither status nor z."""
+    for seed in range(3):
+        factor = 10 ** np.random.default_rng(seed).uniform(-6, 6, SIZES[seed % 3][1])
+        expected, _ = solved(solver, **one_sided(seed, -torch.inf))
+        solution, violation = solved(solver, **one_sided(seed, -1e15, factor=factor))
+        assert solution.solved
+        assert violation <= TOLERANCE
+        assert_close(solution.z, expected.z, rtol=0, atol=1e-5)
+
+
+def test_a_small_bound_holds_beside_a_far_one(solver):
+    """A row near 1e-5 is not violated by 1e-6, whatever its other side."""
+    for far in (torch.inf, 1e9, 1e19):
+        mpc = QPMPC.from_model(
+            [[1.0, 0.1], [0.0, 0.9]],
+            [[0.0], [0.1]],
+            5,
+            stage_weight=[1.0, 0.1, 0.01],
+            action_bounds=([-1e-5], [far]),
+            state_bounds=([-far] * 2, [far] * 2),
+            solver=solver,
+        )
+        u = mpc.policy(torch.tensor([1.0, 0.0]).double())
+        assert_close(u, torch.tensor([-1e-5]).double(), rtol=1e-6, atol=0)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,10 +14,10 @@ BATCH = 6
 
 
 def true_set(seed: int, matrices: tuple[int, ...] = ()):
-    """Return QPs in tensors with their exact solution, and its active set."""
+    """Return QPs with their exact solution, and its active set."""
     known = known_qp(seed, batch=(BATCH,), matrices=matrices)
     solution = solve_qp(known.qp, known.fixed, solver="torch")
-    return programs_of(known), known, solution.active
+    return programs_of(known), known, solution.active.numpy()
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])
@@ -25,8 +26,8 @@ def test_the_right_active_set_is_exact_at_once(seed, matrices):
     p, exact, active = true_set(seed, matrices)
     answer = p.recalled(active)
     assert answer.all_accepted
-    assert_close(answer.z, exact.z, rtol=0, atol=1e-10)
-    assert_close(answer.lam, exact.lam, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(answer.z, exact.z, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(answer.lam, exact.lam, rtol=0, atol=1e-10)
     assert (answer.iterations == 1).all()
 
 
@@ -61,21 +62,21 @@ def test_a_row_in_a_wrong_state_is_corrected(change):
 def test_the_active_sets_given_are_not_changed():
     p, _, active = true_set(6)
     wrong = -active
-    before = wrong.clone()
+    before = wrong.copy()
     p.recalled(wrong)
-    assert torch.equal(wrong, before)
+    assert (wrong == before).all()
 
 
 def test_an_unknown_active_set_is_tried_as_empty():
     p, _, active = true_set(5)
-    empty = active.clone()
+    empty = active.copy()
     empty[[1, 2, 4]] = 0
     active[1:3, 4] = UNKNOWN
     active[4, 0] = -128
     answer, of_empty = p.recalled(active), p.recalled(empty)
-    assert torch.equal(answer.residual.isfinite(), of_empty.residual.isfinite())
-    assert torch.equal(answer.iterations, of_empty.iterations)
-    assert_close(answer.z, of_empty.z, rtol=0, atol=0, equal_nan=True)
+    assert (np.isfinite(answer.residual) == np.isfinite(of_empty.residual)).all()
+    assert (answer.iterations == of_empty.iterations).all()
+    np.testing.assert_array_equal(answer.z, of_empty.z)
     assert answer.iterations[[1, 2, 4]].min() > 1
 
 

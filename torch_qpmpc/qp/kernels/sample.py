@@ -70,6 +70,8 @@ CANCELLED, FLOOR, SHARE = 1e3, 1e-12, 1e-6
 RANGE = 1e3
 #: Passes that split a slope into what a singular H explains and the rest.
 SPLITS = 2
+#: The terms of a row are summed from this error on; |y|, or |b|, bounds them from below.
+CLOSE = 1e-7
 #: A few rounding errors, relative to the terms of a sum.
 ROUNDING = 1e-15
 #: Rounding errors of the value are looked at closely from this size on.
@@ -225,10 +227,10 @@ def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         cost = linear + quadratic + charge
         value[i] = cost + c[i % len(c)]
         force, steep, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
-        short, size = _distance(Cz[i], b_i)
-        worst = max(steep / (1.0 + force), short / (1.0 + size + length))
-        worst = max(worst, _distance(z[i, :n_f], fixed[i])[0])
-        worst = max(worst, _excess(y[i], lam[i], lb_i, ub_i, w_i))
+        worst = max(steep / (1.0 + force), _short(Cz[i], b_i, C[m], z[i]))
+        for j in range(n_f):
+            worst = max(worst, abs(z[i, j] - fixed[i, j]))
+        worst = max(worst, _excess(y[i], lam[i], lb_i, ub_i, w_i, G[m], z[i]))
         worst = max(worst, gap / (1.0 + abs(cost)))
 
         scale = max(abs(cost), abs(linear), abs(quadratic), charge)
@@ -479,24 +481,35 @@ def _forces(z, Hz, G_lam, C_chi, left, q):
 
 
 @compiled
-def _distance(x, y):
-    """Return the largest absolute entries of x - y and of y."""
-    difference = size = 0.0
-    for j in range(len(y)):
-        difference, size = max(difference, abs(x[j] - y[j])), max(size, abs(y[j]))
-    return difference, size
+def _short(Cz, b, C, z):
+    """Return the largest error of C z = b, relative to the terms of its row."""
+    error = 0.0
+    for j in range(len(b)):
+        short = abs(Cz[j] - b[j])
+        relative = short / (1.0 + abs(b[j]))
+        if relative > CLOSE:
+            relative = short / (1.0 + abs(b[j]) + _weighted(z, C[j]))
+        error = max(error, relative)
+    return error
 
 
 @compiled
-def _excess(y, lam, lb, ub, w):
-    """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound."""
+def _excess(y, lam, lb, ub, w, G, z):
+    """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound.
+
+    A violation is relative to the terms of its row, a multiplier to w.
+    """
     error = 0.0
     for j in range(len(y)):
         at, force, weight = y[j], lam[j], w[j]
         above, below = ub[j], lb[j]
-        hard = weight == np.inf
-        excess = max(at - above, below - at) if hard else abs(force) - weight
-        excess /= 1.0 + (abs(at) if hard else weight)
+        if weight == np.inf:
+            over = max(at - above, below - at)
+            excess = over / (1.0 + abs(at))
+            if excess > CLOSE:
+                excess = over / (1.0 + _weighted(z, G[j]))
+        else:
+            excess = (abs(force) - weight) / (1.0 + weight)
         astray = max(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
         error = max(error, max(excess, astray))
     return error

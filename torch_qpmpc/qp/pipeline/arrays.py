@@ -1,6 +1,6 @@
 """Arrays of the pipeline: data, reduced QPs, candidates of backends, certified solutions.
 
-They are NumPy's on the CPU, and tensors on other devices.
+They are NumPy's, on the CPU; `torch_qpmpc.qp.pipeline.device` fills the same tuples with tensors.
 """
 
 from __future__ import annotations
@@ -12,11 +12,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.program import crossed
+from torch_qpmpc.qp.program import INFINITE, Status, crossed
 
 #: The certificate rejects a solution with a larger relative residual or error of its value.
 TOLERANCE = 1e-6
-#: ``np.ndarray`` on the CPU, ``torch.Tensor`` elsewhere.
+#: Hard rows that contradict each other by a larger fraction of their terms are infeasible.
+CONTRADICTED = 1e-7
+#: Optima that are further from zero have a length of their own.
+LONG = 2.0**10
+#: ``np.ndarray``; ``torch.Tensor`` within backends and on a device.
 Array = Any
 
 
@@ -41,13 +45,16 @@ class Theta(NamedTuple):
     def of(cls, data: Sequence[np.ndarray]) -> Theta:
         """Convert H, q, c, C, b, G, lb, ub, w, each with its leading dimension, to float64.
 
-        H becomes its symmetric part, and lb becomes ub where they cross by rounding alone.
+        H becomes its symmetric part, a bound from `INFINITE` on infinite, and lb becomes ub where
+        they cross by rounding alone.
         """
         swapped = data[6] > data[7]
         H, q, c, C, b, G, lb, ub, w = (np.ascontiguousarray(x, np.float64) for x in data)
         if swapped.any():
             bounds = torch.from_numpy(data[6].copy()), torch.from_numpy(data[7].copy())
             lb = np.where(swapped & ~crossed(*bounds).numpy(), ub, lb)
+        if (lb <= -INFINITE).any() or (ub >= INFINITE).any():
+            lb, ub = np.where(lb <= -INFINITE, -np.inf, lb), np.where(ub >= INFINITE, np.inf, ub)
         return cls((H + H.swapaxes(1, 2)) / 2.0, C, G, q, c, b, lb, ub, w)
 
 
@@ -72,6 +79,26 @@ class SoftQPs(NamedTuple):
         """Return the problems at ``index``, with the same matrices."""
         return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
 
+    def in_lengths(self) -> tuple[SoftQPs, np.ndarray, np.ndarray] | None:
+        """Return the QPs in units of their own, and the units of v and lam; None if none is long.
+
+        An optimum far from zero is no match for a solver's absolute tolerances. It is no further
+        than without rows, and seldom than most bounds. Units ``(B, 1)`` are powers of two.
+        """
+        with np.errstate(all="ignore"):
+            curvature = np.ldexp(1.0, np.frexp(np.abs(self.H).max((1, 2), initial=0.0))[1])
+            size = np.abs(self.g).max(-1, initial=0.0) / curvature[self.group]
+            if not ((size > LONG) & (size < np.inf)).any():
+                return None
+            near = (np.where(x != 0, np.abs(x), np.inf) for x in (self.l, self.u))
+            near = np.minimum(*near) / np.linalg.norm(self.G, axis=-1)[self.group]
+            size = np.minimum(size, np.median(near, axis=-1)) if near.shape[1] else size
+        long = (size > LONG) & (size < np.inf)
+        length = np.where(long, np.ldexp(1.0, np.frexp(size)[1]), 1.0)[:, None]
+        force = curvature[self.group, None] * length
+        parts = {"H": self.H / curvature[:, None, None], "g": self.g / force, "w": self.w / force}
+        return self._replace(**parts, l=self.l / length, u=self.u / length), length, force
+
     def in_numpy(self) -> SoftQPs:
         return SoftQPs._make(map(to_numpy, self))
 
@@ -94,11 +121,8 @@ class BackendSolution(NamedTuple):
         for own, new in zip(self, other, strict=True):
             own[index] = new
 
-    def like(self, x: Array) -> BackendSolution:
-        """Return the same as arrays, or as tensors on one device, like ``x``."""
-        if isinstance(x, np.ndarray):
-            return BackendSolution._make(map(to_numpy, self))
-        return BackendSolution._make(torch.as_tensor(field, device=x.device) for field in self)
+    def in_numpy(self) -> BackendSolution:
+        return BackendSolution._make(map(to_numpy, self))
 
 
 class BatchSolution(NamedTuple):
@@ -134,22 +158,23 @@ class BatchSolution(NamedTuple):
 
     def error(self) -> Array:
         """Return the larger of the residual and the value's error, ``(B,)``."""
-        larger: Any = np.maximum if isinstance(self.residual, np.ndarray) else torch.maximum
-        return larger(self.residual, self.value_error)
+        return np.maximum(self.residual, self.value_error)
 
-    def improve(self, index: Array, others: BatchSolution) -> None:
-        """Replace placeholders, and solutions with larger errors than the others', at ``index``."""
-        nothing = ~(self.residual[index] < float("inf"))
-        better = indices(nothing | (others.error() < self.error()[index]))
+    def proved(self) -> Array:
+        """Return the mask of QPs that are proved to have no solution, ``(B,)``."""
+        return (self.status == Status.INFEASIBLE) | (self.status == Status.UNBOUNDED)
+
+    def improve(self, index: np.ndarray, others: BatchSolution) -> None:
+        """Replace solutions by others with a proof or with smaller errors, at ``index``."""
+        nothing = ~(self.residual[index] < np.inf) & (others.residual < np.inf)
+        better = others.proved() | nothing | (others.error() < self.error()[index])
+        better = np.flatnonzero(better)
         self.put(index[better], others.at(better))
 
     def clear(self, index: np.ndarray, placeholders: BatchSolution) -> None:
         """Replace all but the errors of the solutions at ``index``."""
         errors = {"residual": self.residual, "value_error": self.value_error}
         self.put(index, placeholders._replace(**errors).at(index))
-
-    def on_cpu(self) -> BatchSolution:
-        return BatchSolution._make(map(to_numpy, self))
 
 
 def to_numpy(x: Array) -> np.ndarray:
@@ -162,24 +187,6 @@ def to_tensor(x: Array) -> Tensor:
     return torch.from_numpy(x) if isinstance(x, np.ndarray) else x
 
 
-def native_device(x: Tensor) -> torch.device | None:
-    """Return the device of the pipeline's tensors for data like ``x``; None for NumPy arrays."""
-    return x.device if x.is_cuda else None
-
-
-def on_device(x: np.ndarray, device: torch.device | None) -> Array:
-    """Return ``x`` as a tensor on ``device``, or unchanged if ``device`` is None."""
-    return x if device is None else torch.from_numpy(x).to(device)
-
-
-def indices(mask: Array) -> Array:
-    """Return the indices where ``mask`` is True."""
-    return np.flatnonzero(mask) if isinstance(mask, np.ndarray) else mask.nonzero().squeeze(-1)
-
-
-def per_qp(unit: np.ndarray, group: Array) -> Array:
+def per_qp(unit: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Return the row of ``unit`` ``(M, n)`` for each QP, ``(B, n)``, or ``(1, n)`` if M = 1."""
-    if isinstance(group, np.ndarray):
-        return unit if len(unit) == 1 else unit[group]
-    rows = torch.from_numpy(unit).to(group.device)
-    return rows if len(rows) == 1 else rows[group]
+    return unit if len(unit) == 1 else unit[group]

@@ -1,8 +1,6 @@
 """A batch of QPs as arrays (eq:qp2, eq:qp3), and their prepared theta.
 
-Arrays are NumPy's on the CPU and tensors elsewhere, float64 and contiguous, without autograd. They
-are made here, once, and determine the kernels: `torch_qpmpc.qp.kernels.sample` or
-`torch_qpmpc.qp.kernels.sample_torch`.
+Arrays are NumPy's, float64 and contiguous, without autograd, and made here, once.
 
 Each thread caches its latest thetas by the content of their tensors, so that no in-place update,
 copied module or functional call can make a result stale.
@@ -14,7 +12,6 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,14 +19,12 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.batching import broadcast
-from torch_qpmpc.qp.kernels import sample, sample_torch
+from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.pipeline.arrays import (
-    Array,
     BackendSolution,
     BatchSolution,
     SoftQPs,
     Theta,
-    on_device,
     per_qp,
     to_numpy,
 )
@@ -58,7 +53,7 @@ class Prepared:
 
     ``group`` ``(B,)`` is the index of each QP's matrices among the M, zero if theta is shared. The
     elimination of C z = b, by default `condensing.eliminate`, keeps ``n_kept`` leading entries of
-    z: V and Q that keep the same ones share it. Without a ``device`` there are NumPy arrays.
+    z: V and Q that keep the same ones share it.
     """
 
     def __init__(
@@ -66,10 +61,9 @@ class Prepared:
         theta: Theta,
         group: np.ndarray,
         n_kept: int,
-        device: torch.device | None,
         elimination: Elimination | None = None,
     ) -> None:
-        self.theta, self.group, self.n_kept, self.device = theta, group, n_kept, device
+        self.theta, self.group, self.n_kept = theta, group, n_kept
         self._elimination = elimination
         self._known: dict[Any, Any] = {}
 
@@ -77,11 +71,6 @@ class Prepared:
     def shared(self) -> bool:
         """True if the QPs differ only in their fixed entries."""
         return all(len(x) == 1 for x in self.theta)
-
-    @cached_property
-    def native_theta(self) -> Theta:
-        """Theta on the device."""
-        return Theta._make(on_device(x, self.device) for x in self.theta)
 
     @cached_property
     @np.errstate(all="ignore")
@@ -102,24 +91,11 @@ class Prepared:
         return Units.of(self.theta, self.group)
 
     @cached_property
-    def lengths(self) -> Units | None:
-        """Units of the entries of z alone, None if all are one; they do not depend on bounds."""
-        return Units.of_columns(self.theta) if self.units and not self.units.one_length else None
-
-    @cached_property
     def scaled(self) -> Prepared:
         """The same theta, in its `units`."""
         assert self.units is not None
-        return self._in(self.units)
-
-    @cached_property
-    def equilibrated(self) -> Prepared:
-        """The same theta, in its `lengths`."""
-        return self if self.lengths is None else self._in(self.lengths)
-
-    def _in(self, units: Units) -> Prepared:
-        theta = units.scaled(self.theta, self.group)
-        return Prepared(theta, self.group, self.n_kept, self.device)
+        theta = self.units.scaled(self.theta, self.group)
+        return Prepared(theta, self.group, self.n_kept)
 
     def condensed(self, n_f: int) -> Condensed:
         """Return the QPs without C z = b, for n_f fixed entries."""
@@ -128,39 +104,30 @@ class Prepared:
         return self._condensed(n_f) if deficient else condensed
 
     def _condensed(self, n_kept: int) -> Condensed:
-        return self._once(
+        return self.once(
             ("condensed", n_kept), lambda: condense(self.theta, n_kept, self._elimination)
         )
 
     def reduced(self, n_f: int) -> Reduced:
-        """Return the QPs in their free variables, on the device."""
-        return self._once(("reduced", n_f), lambda: self._on_device(self._reduced(n_f)))
-
-    def _reduced(self, n_f: int) -> Reduced:
-        return self._once(
-            ("reduced on the CPU", n_f),
-            lambda: reduce(self.condensed(n_f), self.theta, self.group, n_f),
+        """Return the QPs in their free variables."""
+        return self.once(
+            ("reduced", n_f), lambda: reduce(self.condensed(n_f), self.theta, self.group, n_f)
         )
 
     def convex(self, n_f: int) -> np.ndarray | None:
         """Return the mask of positive semidefinite reduced H, ``(M,)``; None if all are."""
         if self.condensed(n_f).surely_convex:
             return None
-        mask = self._once(("convex", n_f), lambda: convex(self._reduced(n_f).H))
+        mask = self.once(("convex", n_f), lambda: convex(self.reduced(n_f).H))
         return None if mask.all() else mask
 
     def sensitivities(self, n_f: int) -> Sensitivities:
-        """Return the `Sensitivities` of the reduced QPs, on the device."""
-        return self._once(
-            ("sensitivities", n_f), lambda: self._on_device(sensitivities(self._reduced(n_f)))
-        )
+        """Return the `Sensitivities` of the reduced QPs."""
+        return self.once(("sensitivities", n_f), lambda: sensitivities(self.reduced(n_f)))
 
     def sizes(self, n_f: int) -> Sizes:
-        """Return the `Sizes` of the reduced QPs, on the device."""
-        return self._once(
-            ("sizes", n_f),
-            lambda: self._on_device(sizes(self.condensed(n_f), self.theta, n_f)),
-        )
+        """Return the `Sizes` of the reduced QPs."""
+        return self.once(("sizes", n_f), lambda: sizes(self.condensed(n_f), self.theta, n_f))
 
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
@@ -168,24 +135,14 @@ class Prepared:
         matrices = (x if len(x) == 1 else x[used] for x in self.theta[:3])
         vectors = (x if len(x) == 1 else x[index] for x in self.theta[3:])
         theta = Theta(*matrices, *vectors)
-        return group, Prepared(theta, group, self.n_kept, self.device)
+        return group, Prepared(theta, group, self.n_kept)
 
     def eliminated(self, elimination: Elimination, n_f: int) -> Prepared:
         """Return the same theta with another elimination of C z = b, which keeps n_f entries."""
-        return Prepared(self.theta, self.group, n_f, self.device, elimination)
+        return Prepared(self.theta, self.group, n_f, elimination)
 
-    def on_cpu(self) -> Prepared:
-        """Return the same theta as NumPy arrays."""
-        if self.device is None:
-            return self
-        return Prepared(self.theta, self.group, self.n_kept, None, self._elimination)
-
-    def _on_device(self, arrays: Any) -> Any:
-        return type(arrays)._make(
-            on_device(x, self.device) if isinstance(x, np.ndarray) else x for x in arrays
-        )
-
-    def _once(self, name: Any, make: Callable[[], T]) -> T:
+    def once(self, name: Any, make: Callable[[], T]) -> T:
+        """Return what ``make`` made at the first call with this ``name``."""
         if name not in self._known:
             self._known[name] = make()
         return self._known[name]
@@ -196,9 +153,9 @@ LATEST = 4
 _thread = threading.local()
 
 
-def prepared_for(data: Sequence[np.ndarray], n_kept: int, device: torch.device | None) -> Prepared:
+def prepared_for(data: Sequence[np.ndarray], n_kept: int) -> Prepared:
     """Return the cached preparation of H, q, .., w, which the whole batch shares."""
-    kind = (n_kept, device, data[0].dtype, *(x.shape for x in data))
+    kind = (n_kept, data[0].dtype, *(x.shape for x in data))
     content = tuple(x.tobytes() for x in data)
     entries: list[tuple[tuple, Prepared]] = vars(_thread).setdefault("latest", [])
     for position, ((other_kind, other), prepared) in enumerate(entries):
@@ -206,7 +163,7 @@ def prepared_for(data: Sequence[np.ndarray], n_kept: int, device: torch.device |
             entries.insert(0, entries.pop(position))
             return prepared
     theta = Theta.of([x[np.newaxis].copy() for x in data])  # the caller may change its own
-    prepared = Prepared(theta, np.zeros(1, np.int64), n_kept, device)
+    prepared = Prepared(theta, np.zeros(1, np.int64), n_kept)
     entries.insert(0, ((kind, content), prepared))
     del entries[LATEST:]
     return prepared
@@ -220,18 +177,16 @@ class Programs:
     """
 
     prepared: Prepared
-    group: Array
-    fixed: Array
+    group: np.ndarray
+    fixed: np.ndarray
 
     @classmethod
-    def of(
-        cls, *operands: Tensor, n_kept: int | None = None, device: torch.device | None = None
-    ) -> tuple[Programs, torch.Size]:
+    def of(cls, *operands: Tensor, n_kept: int | None = None) -> tuple[Programs, torch.Size]:
         """Return the QPs of H, q, c, C, b, G, lb, ub, w, fixed, flattened, and their batch shape.
 
         QPs that share matrices, or have equal ones, share one copy. The preparation of a theta that
         the whole batch shares is cached. The elimination of C z = b keeps ``n_kept`` leading
-        entries of z, by default the fixed ones. Without a ``device`` there are NumPy arrays.
+        entries of z, by default the fixed ones.
         """
         *theta, fixed = operands
         n_f = fixed.shape[-1]
@@ -241,20 +196,15 @@ class Programs:
         if not shared:
             batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(batch, *batches)
-        fixed = _flattened(fixed.detach(), batch, (n_f,)).to(device, torch.float64).contiguous()
+        fixed = to_numpy(_flattened(fixed.detach(), batch, (n_f,)).double().contiguous())
         flat, group = [to_numpy(x)[np.newaxis] for x in theta], np.zeros(len(fixed), np.int64)
         if not shared:
             flat, group = _flat_theta(theta, batch)
         if all(len(x) == 1 for x in flat):
-            prepared = prepared_for([x[0] for x in flat], n_kept, device)
+            prepared = prepared_for([x[0] for x in flat], n_kept)
         else:
-            prepared = Prepared(Theta.of(flat), group, n_kept, device)
-        if device is None:
-            return cls(prepared, group, fixed.numpy(force=True)), batch
-        own = len(prepared.theta.H) > 1
-        zeros = fixed.new_zeros(len(fixed), dtype=torch.int64)
-        where = on_device(group, device) if own else zeros
-        return cls(prepared, where, fixed), batch
+            prepared = Prepared(Theta.of(flat), group, n_kept)
+        return cls(prepared, group, fixed), batch
 
     def __len__(self) -> int:
         return len(self.group)
@@ -265,44 +215,22 @@ class Programs:
 
     @property
     def theta(self) -> Theta:
-        """Theta on the batch's device."""
-        return self.prepared.native_theta
+        return self.prepared.theta
 
-    @property
-    def kernels(self) -> ModuleType:
-        """Functions for the batch's arrays."""
-        return sample if isinstance(self.fixed, np.ndarray) else sample_torch
-
-    def take(self, index: Array) -> Programs:
+    def take(self, index: np.ndarray) -> Programs:
         """Return the QPs at ``index``."""
-        prepared, device = self.prepared, self.prepared.device
-        at = on_device(index, device) if isinstance(index, np.ndarray) else index
-        group, fixed = self.group[at], self.fixed[at]
+        prepared, group = self.prepared, self.group[index]
         if not prepared.shared:
-            group, prepared = prepared.part(to_numpy(group), to_numpy(index))
-            group = on_device(group, device)
-        return Programs(prepared, group, fixed)
-
-    def on_cpu(self) -> Programs:
-        """Return the same QPs as NumPy arrays."""
-        if isinstance(self.fixed, np.ndarray):
-            return self
-        prepared = self.prepared.on_cpu()
-        return Programs(prepared, to_numpy(self.group), to_numpy(self.fixed))
+            group, prepared = prepared.part(group, index)
+        return Programs(prepared, group, self.fixed[index])
 
     def scaled(self) -> Programs:
         """Return the same QPs in their own units."""
         units = self.prepared.units
-        return self if units is None else self._in(self.prepared.scaled, units)
-
-    def equilibrated(self) -> Programs:
-        """Return the same QPs in lengths of z that do not depend on bounds."""
-        units = self.prepared.lengths
-        return self if units is None else self._in(self.prepared.equilibrated, units)
-
-    def _in(self, prepared: Prepared, units: Units) -> Programs:
+        if units is None:
+            return self
         length = per_qp(units.length, self.group)[:, : self.n_f]
-        return Programs(prepared, self.group, self.fixed / length)
+        return Programs(self.prepared.scaled, self.group, self.fixed / length)
 
     def eliminated(self, elimination: Elimination) -> Programs:
         """Return the same QPs with another elimination of C z = b."""
@@ -320,16 +248,16 @@ class Programs:
         convex = programs.prepared.convex(programs.n_f) if len(programs) else None
         if convex is None:
             return index
-        rest = np.flatnonzero(convex[to_numpy(programs.group)])
+        rest = np.flatnonzero(convex[programs.group])
         return rest if index is None else index[rest]
 
     def unsolved(self, status: np.ndarray | int) -> BatchSolution:
         """Return placeholders of ``status`` ``(B,)``: infinite costs, fixed entries, and zeros."""
         _, C, G, q, *_ = self.prepared.theta
-        n, fixed = len(self), to_numpy(self.fixed)
+        n, fixed = len(self), self.fixed
         z = np.zeros((n, q.shape[-1]))
         z[:, : self.n_f] = np.nan_to_num(fixed, posinf=0.0, neginf=0.0)
-        arrays = BatchSolution(
+        return BatchSolution(
             value=np.full(n, np.inf),
             z=z,
             chi=np.zeros((n, C.shape[1])),
@@ -341,7 +269,6 @@ class Programs:
             iterations=np.zeros(n, np.int64),
             active=np.full((n, G.shape[1]), UNKNOWN, np.int8),
         )
-        return BatchSolution._make(on_device(x, self.prepared.device) for x in arrays)
 
     def valid(self) -> np.ndarray | None:
         """Return the mask of QPs with valid data, ``(B,)``; None if all are valid."""
@@ -349,24 +276,21 @@ class Programs:
         # A sum is finite if its terms are (except on overflow, which no solver survives either).
         if np.isfinite(float(self.fixed.sum())):
             return valid if valid is None or len(valid) == len(self) else valid.repeat(len(self))
-        finite = np.isfinite(to_numpy(self.fixed.sum(-1)))
+        finite = np.isfinite(self.fixed.sum(-1))
         return finite if valid is None else finite & valid
 
     def reduced_qps(self) -> SoftQPs:
         """Return the QPs for a backend, with C z = b and the fixed entries eliminated."""
         reduced = self.prepared.reduced(self.n_f)
         d, r = reduced.H.shape[-1], len(reduced.rows)
-        g_l_u = self.kernels.offsets(self.fixed, self.group, reduced.matrix, reduced.constant)
+        g_l_u = sample.offsets(self.fixed, self.group, reduced.matrix, reduced.constant)
         w = reduced.w
         if len(w) != len(self):  # the same row for each QP, without a copy
-            if isinstance(w, np.ndarray):
-                w = np.ndarray((len(self), r), buffer=w, strides=(0, w.itemsize))
-            else:
-                w = w.expand(len(self), r)
+            w = np.ndarray((len(self), r), buffer=w, strides=(0, w.itemsize))
         g, lower, upper = g_l_u[:, :d], g_l_u[:, d : d + r], g_l_u[:, d + r :]
         return SoftQPs(reduced.H, reduced.G, self.group, g, lower, upper, w)
 
-    def recalled(self, active: Array) -> BatchSolution:
+    def recalled(self, active: np.ndarray) -> BatchSolution:
         """Solve the QPs from active sets ``(B, n_g)``, corrected where needed, and certify them.
 
         The warm start of every solver, for the whole batch at once. Codes are those of
@@ -374,7 +298,7 @@ class Programs:
         The residual is infinite where a set does not.
         """
         sensitivities = self.prepared.sensitivities(self.n_f)
-        return BatchSolution(*self.kernels.recall(active, sensitivities, *self._data()))
+        return BatchSolution(*sample.recall(active, sensitivities, *self._data()))
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -382,13 +306,15 @@ class Programs:
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
         elimination.
         """
-        parts = self.kernels.recover(candidate.v, candidate.lam, *self._data(), passes)
+        parts = sample.recover(candidate.v, candidate.lam, *self._data(), passes)
         value, z, chi, lam, xi, active, residual, error = parts
         steps = candidate.iterations
         status = 0 * steps  # SOLVED, unless an error is too large
         return BatchSolution(value, z, chi, lam, xi, status, residual, error, steps, active)
 
-    def certify(self, z: Array, lam: Array, chi: Array, xi: Array) -> tuple[Array, Array, Array]:
+    def certify(
+        self, z: np.ndarray, lam: np.ndarray, chi: np.ndarray, xi: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Certify z ``(B, n_z)`` and lam ``(B, n_g)``, chi ``(B, n_c)``, xi ``(B, n_f)``.
 
         Returns:
@@ -398,7 +324,7 @@ class Programs:
             larger, the sum of the errors in C z = b, weighted by |chi|, and of the rows'
             complementarity gaps, relative to the cost.
         """
-        return self.kernels.certify(z, lam, chi, xi, *self._data())
+        return sample.certify(z, lam, chi, xi, *self._data())
 
     def _data(self) -> tuple:
         prepared, n_f = self.prepared, self.n_f

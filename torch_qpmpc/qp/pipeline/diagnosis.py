@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
@@ -100,10 +100,10 @@ def _status(qp: _FreeQP, C_range: _Range) -> Status:
     z = C_range.inverse @ qp.b
     z = z + C_range.inverse @ (qp.b - qp.C @ z)
     no_rows = np.zeros(len(qp.w))
-    if _contradict(qp, qp.C @ z - qp.b, no_rows, C_range):
+    if _contradict(qp, qp.C @ z - qp.b, no_rows, z, C_range):
         return Status.INFEASIBLE
     nearest, lam = _nearest_feasible(qp, z, C_range)
-    if _contradict(qp, np.zeros(len(qp.b)), lam, C_range):
+    if _contradict(qp, np.zeros(len(qp.b)), lam, z, C_range):
         return Status.INFEASIBLE
     if _is_feasible(qp, nearest) and _falls(qp, _steepest_recession(qp, C_range)):
         return Status.UNBOUNDED
@@ -126,7 +126,8 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
     A = _product(qp.G[hard], C_range.null) / norms[:, None]
     lower, upper = lower / norms, upper / norms
     length = max(lower.max(), -upper.min())
-    below, above = np.isfinite(lower), np.isfinite(upper)
+    # Bounds that are far away would only spoil the least squares.
+    below, above = lower > -length / ROUNDING, upper < length / ROUNDING
     h = np.concatenate((lower[below], -upper[above])) / length
     E = np.concatenate((np.concatenate((A[below], -A[above])).T, h[None]))
     unit = np.zeros(len(E))
@@ -147,8 +148,13 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
     return z, lam
 
 
-def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, C_range: _Range) -> bool:
-    """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible."""
+def _contradict(
+    qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, z: np.ndarray, C_range: _Range
+) -> bool:
+    """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible.
+
+    Not even one that violates each row by the fraction `CONTRADICTED` of its terms at ``z``.
+    """
     G_lam = qp.G.T @ lam
     for _ in range(3):
         chi = chi - C_range.inverse.T @ (qp.C.T @ chi + G_lam)
@@ -159,12 +165,14 @@ def _contradict(qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, C_range: _Range) 
     with np.errstate(invalid="ignore"):
         charge = np.where(up > 0, up * qp.ub, 0) - np.where(down > 0, down * qp.lb, 0)
         terms = np.where(up > 0, up * qp.ub_size, 0) + np.where(down > 0, down * qp.lb_size, 0)
+    terms = terms.sum() + qp.b_size @ size
+    terms += np.abs(z) @ (np.abs(qp.G).T @ np.abs(lam) + np.abs(qp.C).T @ size)
     residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
     zero = residual <= ROUNDING * (np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down))
     # The residual is charged at the largest |z| that the hard rows allow.
     excess = (residual * np.where(zero, 0, reach)).sum()
     demand = qp.b @ chi + charge.sum() + excess
-    return bool(demand < -SIGNIFICANT * (qp.b_size @ size + terms.sum()))
+    return bool(demand < -CONTRADICTED * terms)
 
 
 def _without_noise(x: np.ndarray, largest: float) -> np.ndarray:

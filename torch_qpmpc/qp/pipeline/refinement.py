@@ -18,7 +18,7 @@ import torch
 
 from torch_qpmpc.qp.kernels.linalg import compiled
 from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
-from torch_qpmpc.qp.pipeline.arrays import BatchSolution
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, TOLERANCE, BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import Status
 
@@ -63,14 +63,14 @@ class Twice(NamedTuple):
 
 def refine(
     programs: Programs, solution: BatchSolution, which: np.ndarray, last: bool = False
-) -> np.ndarray:
-    """Refine the solutions at the indices ``which`` in place; return the indices of failures.
+) -> None:
+    """Refine the solutions at the indices ``which`` in place.
 
-    Large QPs, for which all other ways together are quicker, count as failures until the ``last``.
+    Large QPs, for which all other ways together are quicker, are left until the ``last``.
     """
-    theta, group, failed = programs.theta, programs.group, []
+    theta, group = programs.theta, programs.group
     if not last and sum(programs.theta.C.shape[1:]) ** 3 > MAX_WORK:
-        return which
+        return
     for i in which:
         matrices = (x[group[i]] for x in theta[:3])
         vectors = (x[i % len(x)] for x in theta[3:])
@@ -79,12 +79,9 @@ def refine(
             refined = qp.solve(solution.z[i], solution.lam[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
-        if refined is None:
-            failed.append(i)
-        else:
+        if refined is not None:
             iterations = solution.iterations[i] + refined.iterations
             solution.put(i, refined._replace(iterations=iterations))
-    return np.array(failed, np.int64)
 
 
 class _QP(NamedTuple):
@@ -171,9 +168,10 @@ class _QP(NamedTuple):
         return codes
 
     def row_sizes(self, z: np.ndarray) -> np.ndarray:
-        """Return the size of the terms that each row compares: |G| |z|, and its bounds."""
-        lb, ub = (np.where(np.isfinite(x), np.abs(x), 0) for x in (self.lb, self.ub))
-        return np.abs(self.G) @ np.abs(z) + np.maximum(lb, ub)
+        """Return the size of the terms that each row compares: |G| |z|, and the nearer bound."""
+        y = self.G @ z
+        near = np.where(np.abs(y - self.lb) < np.abs(y - self.ub), self.lb, self.ub)
+        return np.abs(self.G) @ np.abs(z) + np.where(np.isfinite(near), np.abs(near), 0)
 
 
 class _System(NamedTuple):
@@ -335,6 +333,8 @@ class _Point(NamedTuple):
         force = (force.sum(0) + np.abs(qp.C.T) @ np.abs(chi))[n_f:]
         short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), qp.row_sizes(z)))
         off = np.abs(np.concatenate((errors[len(z) - n_f :][:n_c], hard * beyond)))
+        # Rows that contradict each other are held in the middle: no further than is infeasible.
+        off *= TOLERANCE / CONTRADICTED
         residual = max(_ratio(np.abs(errors[: len(z) - n_f]), force), _ratio(off, short))
         xi = -(self.slope.high + qp.q + qp.G.T @ lam + qp.C.T @ chi)[:n_f]
         settled = Status.SOLVED, residual, slip / scale, sets

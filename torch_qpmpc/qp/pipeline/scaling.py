@@ -26,6 +26,8 @@ SMALL, LARGE = 2.0**-7, 2.0**10
 APART = 2.0**14
 #: .. after so many passes of equilibration.
 PASSES = 8
+#: The unit of a row is no smaller than this fraction of its terms.
+SMALLEST = 2.0**-20
 #: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
 ROUNDING = 2.0**-40
 
@@ -71,28 +73,30 @@ class Units(NamedTuple):
     def of_rows_and_cost(cls, theta: Theta, group: np.ndarray) -> Units | None:
         """Return units with one length for all entries of z; None if all of them are one."""
         M, (rows, equalities) = len(theta.H), (row_sums(x) for x in (theta.G, theta.C))
-        q, b, lb, ub = (finite_sizes(x, group, M) for x in (theta.q, *theta[5:8]))
+        near = np.fmin(
+            *(np.where(np.isfinite(x) & (x != 0), np.abs(x), np.nan) for x in theta[6:8])
+        )
+        q, b, near = (finite_sizes(x, group, M) for x in (theta.q, theta.b, near))
         H, q = (x.max(-1, keepdims=True) for x in (column_sizes(theta.H), q))
         b = np.where(b > ROUNDING * b.max(-1, keepdims=True, initial=0.0), b, 0)
-        reach = np.concatenate((np.maximum(lb, ub) / rows, b / equalities), axis=-1)
+        reach = np.concatenate((near / rows, b / equalities), axis=-1)
         sizes = np.concatenate((np.maximum(H, q), rows, equalities, reach), axis=-1)
         if (sizes[:, 0] > 0).all() and not _unusual(sizes).any():
             return None
-        length = _typical(reach)
+        # A bound, however large, demands no large z, and a large z is compared with itself.
+        length = np.minimum(_typical(reach), 1.0)
         cost = np.maximum(H * length**2, q * length)
         of_rows = (finite_sizes(theta.w, group, M) * rows * length).max(
             -1, keepdims=True, initial=0.0
         )
         cost = np.where(cost > 0, cost, np.maximum(cost, of_rows))  # a QP without any other cost
-        powers = (_power_above(x) for x in (cost, rows * length, equalities * length))
-        cost, rows, equalities = powers
+        # A hard row near a small bound is judged relative to that.
+        rows, equalities = rows * length, equalities * length
+        hard = np.isinf(theta.w).any(0) & (near > 0)
+        rows = np.where(hard, np.minimum(rows, np.maximum(near, SMALLEST * rows)), rows)
+        cost, rows, equalities = (_power_above(x) for x in (cost, rows, equalities))
         units = cls(cost, length, rows, equalities)
         return units if any((unit != 1).any() for unit in units) else None
-
-    @property
-    def one_length(self) -> bool:
-        """True if all entries of z have the same length."""
-        return self.length.shape[-1] == 1
 
     def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
         """Return theta in these units."""
@@ -110,10 +114,6 @@ class Units(NamedTuple):
             theta.ub / rows,
             theta.w * (rows / cost),
         )
-
-    def inverse(self) -> Units:
-        """Return the units that convert the scaled QPs to the original ones."""
-        return Units(*(1 / unit for unit in self))
 
     def restored(self, solution: BatchSolution, group: Array) -> BatchSolution:
         """Return solutions in the original numbers, with the same relative residuals."""

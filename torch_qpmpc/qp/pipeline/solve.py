@@ -1,4 +1,4 @@
-"""Solve and certify QPs (eq:qp2, eq:qp3): one strategy after the other, until all are certified.
+"""Solve and certify QPs (eq:qp2, eq:qp3): one step after the other, until all are certified.
 
 Tensors become arrays once; all else is in float64, without autograd.
 """
@@ -10,7 +10,8 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,17 +21,14 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import broadcast, flatten_batch
 from torch_qpmpc.qp.pipeline.arrays import (
     TOLERANCE,
-    Array,
     BatchSolution,
     SoftQPs,
-    indices,
-    native_device,
-    on_device,
     to_numpy,
     to_tensor,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
+from torch_qpmpc.qp.pipeline.device import accelerator, attempt
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
@@ -113,7 +111,7 @@ _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 @serially_if_forked
 def solve_now(*arguments: Any) -> BatchSolution:
-    """Solve a batch, on the CPU or, with ``solver="torch"``, on the device of q.
+    """Solve a batch; with ``solver="torch"``, the device of q makes the first attempt.
 
     The ``arguments`` are H, q, c, C, b, G, lb, ub, w and ``fixed``; the active sets ``(*batch,
     n_g)`` of a warm start, or None; ``n_kept`` of `Programs.of`; ``solver`` and ``on_failure``.
@@ -123,13 +121,12 @@ def solve_now(*arguments: Any) -> BatchSolution:
     backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
-    device = native_device(q) if solver == "torch" else None
+    device = accelerator(q) if solver == "torch" else None
     try:
-        programs, batch = Programs.of(*theta, fixed, n_kept=n_kept, device=device)
+        programs, batch = Programs.of(*theta, fixed, n_kept=n_kept)
         if start is not None:
-            start = flatten_batch(start.detach().to(q.device).expand(*batch, -1)).contiguous()
-        sets = start.numpy(force=True) if start is not None and device is None else start
-        solution = solve_programs(programs, solver, sets)
+            start = to_numpy(flatten_batch(start.expand(*batch, -1)).contiguous())
+        solution = solve_programs(programs, solver, start, device)
     except (MemoryError, RuntimeError) as error:
         # torch's allocator on the CPU reports a failure only in the message.
         failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
@@ -155,7 +152,7 @@ def solve_now(*arguments: Any) -> BatchSolution:
 
 
 def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:
-    statuses = torch.as_tensor(solution.status).cpu()
+    statuses = torch.as_tensor(solution.status)
     failed = statuses.nonzero().squeeze(-1)
     reasons = []
     for status in Status:
@@ -177,13 +174,13 @@ def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None
 class AtRest:
     """QPs of a theta at rest, solved one after the other.
 
-    What that does not solve, or the certificate rejects, is solved as any other QP. ``n_f`` is the
-    number of fixed entries of z, ``n_kept`` that of `Programs.of`.
+    QPs that this leaves unsolved take the ordinary steps. ``n_f`` is the number of fixed entries of
+    z, ``n_kept`` that of `Programs.of`.
     """
 
     def __init__(self, qp: QuadraticProgram, n_f: int, n_kept: int, solver: str) -> None:
         data = [to_numpy(x.detach()) for x in qp.tensors()]
-        self.prepared, self.solver = prepared_for(data, n_kept, None), solver
+        self.prepared, self.solver = prepared_for(data, n_kept), solver
         self._active, programs = (
             np.zeros((1, qp.lb.shape[-1]), np.int8),
             self._of(np.zeros((1, n_f))),
@@ -215,7 +212,6 @@ class AtRest:
         solution, units = programs.scaled().recalled(self._active), self.prepared.units
         if units is not None:
             solution = units.restored(solution, programs.group)
-            _refuted(*_in_own_lengths(programs, solution), programs.group)
         if max(solution.residual[0], solution.value_error[0]) > TOLERANCE:
             return None
         self._active = solution.active
@@ -225,39 +221,148 @@ class AtRest:
         return Programs(self.prepared, np.zeros(1, np.int64), fixed)
 
 
-class Strategy(NamedTuple):
-    """One way to solve QPs: from their last active sets, or by a backend."""
-
-    solve: Backend
-    start: Array | None = None
-    eliminate: Eliminate | None = None
-
-    def prepared(self, programs: Programs) -> Programs | None:
-        """Return the QPs with this elimination; None if it does not apply."""
-        if self.eliminate is None:
-            return programs
-        C = programs.theta.C
-        elimination = self.eliminate(C, programs.n_f) if C.size else None
-        return None if elimination is None else programs.eliminated(elimination)
-
-    def certified(self, programs: Programs) -> BatchSolution:
-        """Return candidates, completed and certified; active sets that do not settle are none."""
-        if self.start is not None:
-            return programs.recalled(self.start)
-        qps = programs.reduced_qps()
-        solve = self.solve if qps.l.shape[-1] else _unconstrained
-        return programs.recover(solve(qps).like(programs.fixed), PASSES if self.eliminate else 0)
+#: A step maps QPs without a certified solution, and their best candidates so far, to candidates.
+Step = Callable[[Programs, BatchSolution], BatchSolution]
 
 
-def strategies(solver: str, start: Array | None) -> list[Strategy]:
-    """Return the ways to solve QPs, each for those that the ones before do not solve.
+def solve_programs(
+    programs: Programs,
+    solver: str,
+    start: np.ndarray | None = None,
+    device: torch.device | None = None,
+) -> BatchSolution:
+    """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
 
-    Other eliminations follow the solver, for ill-conditioned QPs, and then other solvers.
+    ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`; a
+    ``device`` makes the first attempt.
     """
-    own = backend(solver)
-    last_sets = [] if start is None else [Strategy(own, start)]
-    eliminations = [Strategy(BACKENDS["torch"], eliminate=way) for way in OTHER_ELIMINATIONS]
-    return [*last_sets, Strategy(own), *eliminations, *map(Strategy, fallbacks(solver))]
+    began, log = time.perf_counter(), _active_log.get(None) or SolveLog()
+    units = programs.prepared.units
+    steps = steps_of(solver, log, start is not None, device)
+    solution = _solved(programs.scaled(), steps, start)
+    if units is not None:
+        solution = units.restored(solution, programs.group)
+    log.add(solution, time.perf_counter() - began)
+    return solution
+
+
+def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> BatchSolution:
+    """Take the steps until each QP has a certified solution, or a proof that it has none."""
+    solution, todo = programs.unsolved(Status.INVALID_DATA), programs.solvable()
+    todo = np.arange(len(programs)) if todo is None else todo
+    solution.status[todo] = Status.NOT_CONVERGED
+    if start is not None:
+        solution.active[:] = start
+    for step in steps:
+        if not len(todo):
+            break
+        whole = len(todo) == len(programs)
+        left, best = programs if whole else programs.take(todo), solution.at(todo)
+        answer = step(left, best)
+        if whole and answer.all_accepted:
+            return answer
+        solution.improve(todo, answer)
+        todo = todo[~(solution.accepted() | solution.proved())[todo]]
+    solution.status[todo] = Status.NOT_CONVERGED
+    unsolved = np.flatnonzero(~solution.accepted())
+    solution.clear(unsolved, programs.unsolved(solution.status))
+    return solution
+
+
+def steps_of(
+    solver: str, log: SolveLog, warm: bool = False, device: torch.device | None = None
+) -> list[Step]:
+    """Return the steps of a solve, each for the QPs that the ones before leave.
+
+    Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
+    them after other eliminations, which solve whole batches.
+    """
+    *others, last = map(backed, fallbacks(solver))
+    refined = partial(_refined, log)
+    return [
+        *([partial(_tried, device)] if device else []),
+        *([partial(_recalled, log)] if warm else []),
+        backed(backend(solver)),
+        partial(_if_few, refined),
+        partial(_counted, log),
+        partial(_if_few, _diagnosed),
+        *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
+        refined,
+        _diagnosed,
+        *others,
+        partial(_refined_last, log, last),
+    ]
+
+
+def backed(solve: Backend, passes: int = 0) -> Step:
+    """Return the step of a backend, see `Programs.recover`."""
+
+    def step(programs: Programs, _: BatchSolution) -> BatchSolution:
+        qps = programs.reduced_qps()
+        answer = _in_lengths(solve if qps.l.shape[-1] else _unconstrained, qps)
+        return programs.recover(answer, passes)
+
+    return step
+
+
+def _tried(device: torch.device, programs: Programs, _: BatchSolution) -> BatchSolution:
+    return attempt(programs, device)
+
+
+def _recalled(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
+    """Solve from the candidates' active sets."""
+    answer = programs.recalled(best.active)
+    log.recalled += int(answer.accepted().sum())
+    return answer
+
+
+def _refined(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
+    """Refine near misses."""
+    near = np.flatnonzero(best.residual <= NEARLY)
+    log.refined += len(near)
+    refine(programs, best, near)
+    return best
+
+
+def _refined_last(
+    log: SolveLog, step: Step, programs: Programs, best: BatchSolution
+) -> BatchSolution:
+    """Refine the candidates of a step, whatever was refined before, and however large."""
+    answer = step(programs, best)
+    left = np.flatnonzero(~answer.accepted())
+    log.refined += len(left)
+    refine(programs, answer, left, last=True)
+    return answer
+
+
+def _counted(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
+    log.fallback += len(programs)
+    return best
+
+
+def _diagnosed(programs: Programs, best: BatchSolution) -> BatchSolution:
+    return best._replace(status=diagnose(programs))
+
+
+def _if_few(step: Step, programs: Programs, best: BatchSolution) -> BatchSolution:
+    return step(programs, best) if len(programs) <= FEW else best
+
+
+def _eliminated(eliminate: Eliminate, programs: Programs, best: BatchSolution) -> BatchSolution:
+    """Solve with another elimination of C z = b, if it applies."""
+    C = programs.theta.C
+    if not C.size or (elimination := eliminate(C, programs.n_f)) is None:
+        return best
+    return backed(BACKENDS["torch"], PASSES)(programs.eliminated(elimination), best)
+
+
+def _in_lengths(solve: Backend, qps: SoftQPs) -> BackendSolution:
+    """Solve QPs, in lengths of their own where these are unusual."""
+    if (own := qps.in_lengths()) is None:
+        return solve(qps).in_numpy()
+    qps, length, force = own
+    v, lam, iterations = solve(qps).in_numpy()
+    return BackendSolution(v * length, lam * force, iterations)
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
@@ -265,136 +370,3 @@ def _unconstrained(qps: SoftQPs) -> BackendSolution:
     H, _, group, g, lam, _, _ = qps.in_torch()
     v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
     return BackendSolution(v, lam, torch.zeros_like(group))
-
-
-def solve_programs(programs: Programs, solver: str, start: Array | None = None) -> BatchSolution:
-    """Solve and certify B QPs; the status of an unsolved one is its diagnosis.
-
-    ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`.
-    """
-    began = time.perf_counter()
-    log = _active_log.get(unused := SolveLog())
-    units = programs.prepared.units
-    if units is None:
-        solution = _solved(programs, solver, start, log)
-    else:
-        scaled = programs.scaled()
-        solution = units.restored(_solved(scaled, solver, start, log), scaled.group)
-        solution = _confirmed(programs.on_cpu(), solver, solution.on_cpu(), log)
-    if log is not unused:
-        log.add(solution, time.perf_counter() - began)
-    return solution
-
-
-def _solved(
-    programs: Programs,
-    solver: str,
-    start: Array | None,
-    log: SolveLog,
-    solution: BatchSolution | None = None,
-) -> BatchSolution:
-    """Try one strategy after the other on the QPs without a certified solution.
-
-    The first runs on their device. Up to `FEW` QPs that the solver leaves are refined and diagnosed
-    one by one; of more, those that the other eliminations leave, which solve whole batches. A QP
-    that is proved to have no solution is not tried again. ``solution`` holds candidates that were
-    rejected before.
-    """
-    status = np.full(len(programs), int(Status.NOT_CONVERGED))
-    todo = programs.solvable() if solution is None else np.arange(len(programs))
-    if solution is None and todo is not None:
-        status[:] = Status.INVALID_DATA
-        solution, status[todo] = programs.unsolved(status), Status.NOT_CONVERGED
-        todo = on_device(todo, programs.prepared.device)
-        start = None if start is None else start[todo]
-    ways = strategies(solver, start)
-    own = singly = ways[start is not None]
-    for way in ways:
-        if todo is not None and not len(todo):
-            break
-        rest = way.prepared(programs if todo is None else programs.take(todo))
-        if rest is not None:
-            answer = way.certified(rest)
-            if way.start is not None:
-                log.recalled += int(answer.accepted().sum())
-            if todo is None and answer.all_accepted:
-                return answer
-            if way.start is None and not answer.all_accepted:  # what follows needs the CPU
-                programs, answer = programs.on_cpu(), answer.on_cpu()
-                solution = solution and solution.on_cpu()
-                todo = None if todo is None else to_numpy(todo)
-            if solution is None or todo is None:
-                solution, todo = answer, indices(~answer.accepted())
-            else:  # the last candidate is refined, whatever was refined before
-                (solution.put if way is ways[-1] else solution.improve)(todo, answer)
-                todo = todo[~solution.accepted()[todo]]
-        assert solution is not None
-        assert todo is not None
-        if way is own and len(todo) > FEW:
-            log.fallback += len(todo)
-            singly = [way for way in ways if way.eliminate is not None][-1]
-        last = way is ways[-1]
-        if (way is singly or last) and len(todo):
-            near = todo if last else todo[solution.residual[todo] <= NEARLY]
-            log.refined += len(near)
-            refine(programs, solution, near, last)
-            todo = todo[~solution.accepted()[todo]]
-        if way is singly and len(todo):
-            log.fallback += len(todo) if way is own else 0
-            status[todo] = diagnose(programs.take(todo))
-            todo = todo[status[todo] == Status.NOT_CONVERGED]
-    assert solution is not None
-    if not solution.all_accepted:
-        programs, solution = programs.on_cpu(), solution.on_cpu()
-        solution.clear(np.flatnonzero(~solution.accepted()), programs.unsolved(status))
-    return solution
-
-
-def _in_own_lengths(programs: Programs, solution: BatchSolution) -> tuple[Programs, BatchSolution]:
-    """Return QPs and solutions in the numbers that are certified, with the same errors.
-
-    They are the original ones; of numbers whose columns differ by orders of magnitude, those in
-    lengths of z that follow from the matrices: the error of a value has no bound without.
-    """
-    if (lengths := programs.prepared.lengths) is None:
-        return programs, solution
-    return programs.equilibrated(), lengths.inverse().restored(solution, programs.group)
-
-
-def _confirmed(
-    programs: Programs, solver: str, solution: BatchSolution, log: SolveLog
-) -> BatchSolution:
-    """Certify scaled solutions in the original numbers, too; solve second those that fail.
-
-    The units depend on the bounds. A bound that is far from every solution, such as a large number
-    in place of inf, makes them so large that a certificate in these units misses errors.
-    """
-    units, accepted = programs.prepared.units, np.flatnonzero(solution.accepted())
-    assert units is not None
-    scaled, lengths = programs.scaled(), programs.prepared.lengths
-    programs, solution = _in_own_lengths(programs, solution)
-    if lengths is not None:
-        units = units._replace(length=units.length / lengths.length)
-    rejected = _refuted(programs, solution, accepted)
-    if len(rejected):
-        part, second = programs.take(rejected), SolveLog()
-        again = _solved(part, solver, None, second, solution.at(rejected))
-        solution.put(rejected, again)
-        in_units = units.inverse().restored(solution, programs.group)
-        unsure = _refuted(scaled, in_units, rejected[again.accepted()])
-        failed = refine(programs, solution, unsure)
-        solution.put(failed, programs.unsolved(Status.NOT_CONVERGED).at(failed))
-        log.refined += second.refined + len(unsure)
-    return solution if lengths is None else lengths.restored(solution, programs.group)
-
-
-def _refuted(programs: Programs, solution: BatchSolution, which: np.ndarray) -> np.ndarray:
-    """Raise the residuals at the indices ``which`` to the QPs' own; return those rejected."""
-    if not len(which):
-        return which
-    solved = solution.at(which)
-    part = programs if len(which) == len(programs) else programs.take(which)
-    _, residual, error = part.certify(solved.z, solved.lam, solved.chi, solved.xi)
-    solution.residual[which] = np.maximum(solved.residual, residual)
-    solution.value_error[which] = np.maximum(solved.value_error, error)
-    return which[(residual > TOLERANCE) | (error > TOLERANCE)]

@@ -45,8 +45,11 @@ FALLBACKS = ("daqp", "torch")
 
 
 def fallbacks(name: str) -> list[Backend]:
-    """Return the backends that solve again, cold, the QPs for which ``name`` was rejected."""
-    return [BACKENDS[other] for other in FALLBACKS if other != name]
+    """Return the backends that solve again, cold, the QPs for which ``name`` was rejected.
+
+    The last is the same for each, so that none decides whether a QP has a solution.
+    """
+    return [BACKENDS[other] for other in FALLBACKS if other != name or other == FALLBACKS[-1]]
 
 
 __all__ = ["BACKENDS", "Backend", "BackendSolution", "backend", "fallbacks"]

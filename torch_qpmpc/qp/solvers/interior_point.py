@@ -25,7 +25,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.kernels.sample_torch import largest
+from torch_qpmpc.qp.kernels.batched import largest
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solution import row_states
 
@@ -35,6 +35,10 @@ _largest = partial(largest, keepdim=True)
 HUGE = 1e100
 #: A row up to this narrow, relative to its larger bound, counts as an equality.
 NARROW = 1e-6
+#: Bounds are far apart if wider than this many times the typical bound or unconstrained optimum, ..
+WIDE = 1e3
+#: .. and a bound beyond this many times that does not act.
+FAR = 1e8
 #: A typical multiplier, relative to the largest force.
 TYPICAL = 0.05
 #: Least typical curvature, relative to the largest force over a length.
@@ -97,13 +101,20 @@ class BatchedQPs:
         lower, upper, w = qps.l.clamp(min=-HUGE), qps.u.clamp(max=HUGE), qps.w.clamp(max=HUGE)
         size = _largest(G).squeeze(-1)
         size = torch.where(size > 1 / HUGE, size, 1.0)
+        stiffest = _largest(H.flatten(1))
+        near = lower.abs().minimum(upper.abs()) / size
+        near = near.masked_fill(~((near > 0) & (near < 1e-10 * HUGE)), torch.nan)
+        near = near.nanmedian(-1, keepdim=True).values.nan_to_num(1.0)
+        near = near.maximum(_largest(g) / stiffest).nan_to_num(HUGE)
+        far = FAR * size * near
+        lower, upper = lower.where(lower >= -far, -HUGE), upper.where(upper <= far, HUGE)
         width = (upper - lower) / size
         narrow = upper - lower <= NARROW * lower.abs().maximum(upper.abs())
-        known = ~narrow & (width < 1e-10 * HUGE)
+        known = ~narrow & (width < WIDE * near)
         median = width.masked_fill(~known, torch.nan).nanmedian(-1, keepdim=True).values
         median = median.nan_to_num(1.0)
         width = torch.where(known, width, median).maximum(1e-3 * median)
-        length, stiffest = width.amin(-1, keepdim=True), _largest(H.flatten(1))
+        length = width.amin(-1, keepdim=True)
         force = _largest(g) + stiffest * length
         force = torch.where(force > 0, force, 1.0)
         curvature = stiffest.maximum(FLAT * force / length)

@@ -1,0 +1,61 @@
+"""The first attempt of a device that is not the CPU: QPs solved and certified there, in torch.
+
+What it certifies is taken; the rest goes the CPU's way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs, Theta, to_numpy
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.condensing import Reduced, Sizes
+from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.solvers import interior_point
+
+
+def accelerator(x: Tensor) -> torch.device | None:
+    """Return the device of x; None if that is the CPU."""
+    return x.device if x.is_cuda else None
+
+
+def attempt(programs: Programs, device: torch.device) -> BatchSolution:
+    """Return candidates of the interior-point method on ``device``, completed and certified."""
+    if not len(programs) or not len(programs.prepared.reduced(programs.n_f).rows):
+        return programs.unsolved(Status.NOT_CONVERGED)
+    theta, reduced, sizes = on_device(programs, device)
+    group, fixed = (torch.from_numpy(x).to(device) for x in (programs.group, programs.fixed))
+    qps = reduced_qps(reduced, group, fixed)
+    v, lam, iterations = interior_point.solve(qps)
+    parts = sample_torch.recover(v, lam, group, fixed, theta, reduced, sizes)
+    value, z, chi, lam, xi, active, residual, error = map(to_numpy, parts)
+    steps = to_numpy(iterations)
+    return BatchSolution(value, z, chi, lam, xi, 0 * steps, residual, error, steps, active)
+
+
+def on_device(programs: Programs, device: torch.device) -> tuple[Theta, Reduced, Sizes]:
+    """Return theta and what follows from it as tensors, copied once for each theta."""
+    prepared, n_f = programs.prepared, programs.n_f
+
+    def moved(x: Any) -> Any:
+        if isinstance(x, np.ndarray):
+            return torch.from_numpy(x).to(device)
+        return type(x)._make(map(moved, x)) if hasattr(x, "_make") else x
+
+    def parts() -> tuple[Theta, Reduced, Sizes]:
+        return moved(prepared.theta), moved(prepared.reduced(n_f)), moved(prepared.sizes(n_f))
+
+    return prepared.once(("on device", device, n_f), parts)
+
+
+def reduced_qps(reduced: Reduced, group: Tensor, fixed: Tensor) -> SoftQPs:
+    """Return the QPs for the interior-point method, as `Programs.reduced_qps`."""
+    d, r = reduced.H.shape[-1], len(reduced.rows)
+    offsets = sample_torch.multiply(reduced.matrix.mT, group, fixed) + reduced.constant
+    g, lower, upper = offsets.split((d, r, r), -1)
+    return SoftQPs(reduced.H, reduced.G, group, g, lower, upper, reduced.w.expand(len(group), r))
