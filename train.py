@@ -137,6 +137,8 @@ def _train(
                 evaluation.rivals[IDENTIFICATION] = J[-1]
         interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
 
+        changed, judged = False, {}  # what is kept, since its last evaluation; the last verdict
+        shown: dict[str, str] = {}  # beside the bar
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
         # A log file gets a line in ten seconds.
         rest = {"mininterval": 0.1 if sys.stderr.isatty() else 10, "disable": quiet}
@@ -157,22 +159,28 @@ def _train(
                 if cfg.replay:
                     replay.remember(sample)
                 learner.scheduler.step()
-            tally.add(batch)
+            tally.add(batch, terms)
+            shown["accepted"] = f"{tally.accepted}/{update}"
+            progress.set_postfix(shown, refresh=False)
             progress.update()
 
             if update % cfg.log_interval == 0:
                 run.log(update_metrics(terms, losses, tally, times, mpc, learner), update)
-            run.log(gate.judge(update), update)
+            judged = gate.judge(update)
+            run.log(judged, update)
+            changed |= not cfg.gate or bool(judged.get("gate/accepted"))
             last = update == cfg.updates
             evaluated = last or update % cfg.eval_interval == 0
             if evaluated:
-                evaluation.evaluate(gate.policy)
+                if changed:
+                    evaluation.evaluate(gate.policy)
+                    changed = False
                 if last:
                     evaluation.identify(partial(transitions, identified, replay))
                 gap = report(run, gate.mpc, evaluation, update)
-                closed = gap["closed_gap"]
-                known = {"closed_gap": closed} if math.isfinite(closed) else {}
-                progress.set_postfix(J=cost_text(gap["J_best"]), **known)
+                shown["J"], closed = cost_text(gap["J_best"]), gap["closed_gap"]
+                shown |= {"closed_gap": f"{closed:.3f}"} if math.isfinite(closed) else {}
+                progress.set_postfix(shown)
             if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)
@@ -184,7 +192,8 @@ def _train(
         gate.save(run.path)
         if cfg.figures:
             draw_outcome(run, gate.mpc, evaluation)
-        evaluation.evaluate(learner.policy, "candidate")
+        if cfg.gate and not judged.get("gate/accepted"):
+            evaluation.evaluate(learner.policy, "candidate")
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
         run.finish(summary)

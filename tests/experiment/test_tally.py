@@ -22,8 +22,8 @@ def batch(reward: float) -> TensorDict:
 def test_costs_are_averaged():
     tally = Tally()
     for update in range(1, 21):
-        tally.add(batch(-float(update)))
-    assert tally.update == 20
+        tally.add(batch(-float(update)), {"train/accepted": torch.tensor(update % 2)})
+    assert (tally.update, tally.summary()["accepted_updates"]) == (20, 10)
     assert tally.metrics()["train/reward"] == -20
     summary = tally.summary()
     assert (summary["train_cost"], summary["train_cost_last_tenth"]) == (10.5, 19.5)
@@ -34,7 +34,7 @@ def test_a_row_has_the_qps_since_the_one_before():
     for count in (4, 2):
         with tally.timed():
             mpc.value(random_states(count))
-        tally.add(batch(0.0))
+        tally.add(batch(0.0), {})
         tally.qps.unsolved += 1
         row = tally.metrics()
         assert (row["qp/solves"], row["qp/unsolved"]) == (count, 1)
@@ -57,7 +57,7 @@ def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyP
 
 def test_a_tally_is_restored_from_its_state():
     tally = Tally()
-    tally.add(batch(-1.0))
+    tally.add(batch(-1.0), {})
     tally.qps.solves = 7
     twin = Tally()
     twin.load_state_dict(tally.state_dict())

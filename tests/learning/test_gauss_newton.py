@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 
 import pytest
 import torch
@@ -12,8 +13,9 @@ from torch.testing import assert_close
 from tests.gauss_newton import Reference, penalty
 from tests.problems import MIXED, normal, random_mpc, random_states
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
-from torch_qpmpc.learning.gauss_newton import FALL, RISE
+from torch_qpmpc.learning.gauss_newton import FALL, FIRST, RISE
 from torch_qpmpc.learning.td_error import inverse_variance
+from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 COUNT, DAMPING = 7, 0.2
 ALL = ("H", "H_f", "q", "c", "C", "b", "G", "lb", "ub", "w")
@@ -124,6 +126,31 @@ def test_a_step_that_raises_the_errors_is_taken_back():
     assert not report.ratio > 0
     assert_close(mpc.state_dict(), before, rtol=0, atol=0)
     assert optimizer.param_groups[0]["damping"] == RISE * report.damping
+
+
+def test_steps_that_stall_are_warned_of_and_cost_few_qps():
+    """x_1 <= 1 is hard: from x_0 = 1 it is infeasible with any larger A, which targets ask for."""
+    A, B = torch.ones(1, 1), torch.ones(1, 1)
+    hard = {"state_bounds": ([-1.0], [1.0]), "state_slack": math.inf, "on_failure": "mask"}
+    mpc = QPMPC.from_model(A, B, 1, stage_weight=[1.0, 0.1], learn=("C",), structure="tied", **hard)
+    optimizer, before = GaussNewton(mpc), copy.deepcopy(mpc.state_dict())
+    s = torch.tensor([1.0, -1.0]).repeat(40).unsqueeze(-1)
+    a, target = torch.zeros(80, 1), torch.full((80,), 3.0)
+    counts = []
+    for step in range(5):
+        with SolveLog() as log, warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            report = optimizer.step(s, a, target)
+        counts.append(log.solves)
+        assert (report.accepted, report.ratio) == (False, -math.inf)
+        assert len(caught) == (step == 4)
+    assert counts == [160, *[80 + FIRST] * 4]
+    assert "5 steps in a row that were taken back, because they left QPs" in str(caught[0].message)
+    assert "make hard rows soft" in str(caught[0].message)
+    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
+    s, a = torch.full((4, 1), 0.5), torch.zeros(4, 1)
+    assert optimizer.step(s, a, mpc.action_value(s, a).detach() + 1e-3).accepted
+    assert optimizer.state_dict()["param_groups"][0]["rejected"] == 0
 
 
 def test_the_damping_comes_back_to_its_least():

@@ -79,12 +79,10 @@ def make_learner(cfg: DictConfig, operator: QPActorValueOperator) -> Learner:
     loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip, weighted=cfg.weighted)
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     penalties = make_penalties(cfg, mpc)
-    optimizer = make_optimizer(cfg, mpc)
+    optimizer: Any = make_optimizer(cfg, mpc)
     scheduler = make_scheduler(cfg, optimizer)
-    if isinstance(optimizer, GaussNewton):
-        update = second_order(mpc, loss_module, optimizer, *penalties)
-    else:
-        update = first_order(mpc, loss_module, optimizer, *penalties)
+    make = second_order if isinstance(optimizer, GaussNewton) else first_order
+    update = make(mpc, loss_module, optimizer, *penalties)
     return Learner(
         update,
         loss_module,

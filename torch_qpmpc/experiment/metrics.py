@@ -34,7 +34,7 @@ class Tally:
         update: number of the last update.
         costs: mean stage cost of each update.
         qps: counts of solves since the last row of metrics.
-        unsolved: number of unsolved QPs before that.
+        unsolved, accepted: numbers of unsolved QPs before that, and of updates that moved theta.
         seconds: training time without the compilation of kernels.
     """
 
@@ -42,6 +42,7 @@ class Tally:
     costs: list[float] = field(default_factory=list)
     qps: SolveLog = field(default_factory=SolveLog)
     unsolved: int = 0
+    accepted: int = 0
     seconds: float = 0.0
 
     def state_dict(self) -> dict[str, Any]:
@@ -65,9 +66,10 @@ class Tally:
         times.append(time.perf_counter())
         self.seconds += times[-1] - times[0]
 
-    def add(self, batch: TensorDictBase) -> None:
-        """Add an update with its collected batch."""
+    def add(self, batch: TensorDictBase, terms: Mapping[str, Tensor]) -> None:
+        """Add an update with its collected batch and the terms of its loss."""
         self.update += 1
+        self.accepted += bool(terms.get("train/accepted", 1))
         self.costs.append(-batch["next", "reward"].nanmean().item())
 
     def metrics(self) -> dict[str, float]:
@@ -84,6 +86,7 @@ class Tally:
             "train_cost": sum(self.costs) / len(self.costs),
             "train_cost_last_tenth": sum(last) / len(last),
             "unsolved": self.unsolved + self.qps.unsolved,
+            "accepted_updates": self.accepted,
         }
 
 

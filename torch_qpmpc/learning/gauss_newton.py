@@ -10,6 +10,7 @@ by its dual; `learning.kernel` has that and D.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,9 @@ from torch_qpmpc.qp.solution import QPSolution
 POOR, GOOD = 0.25, 0.75
 #: Factors by which the damping rises and falls, and its upper bound.
 RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
+#: Rejections in a row that are warned of, and the pairs that a step is tried on first where the
+#: one before left QPs unsolved: these take long.
+STALLED, FIRST = 5, 16
 
 
 def _positive(x: float) -> bool:
@@ -83,7 +87,8 @@ class GaussNewton(torch.optim.Optimizer):
             on it. A larger one makes a step less sensitive to its batch's noise.
         td_error_clip: bound on the absolute TD error; none by default.
         trust_region: solve the batch again after each step and its projection; undo a step that
-            raised the squared errors, and adapt the damping to actual over predicted decrease.
+            raised the squared errors or left a QP unsolved, and adapt the damping to actual over
+            predicted decrease. Five of them in a row are a `RuntimeWarning`.
         weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
@@ -203,6 +208,7 @@ class GaussNewton(torch.optim.Optimizer):
             for block, value in zip(blocks, old, strict=True):
                 block.leaf.copy_(value)
         self._adapt(ratio)
+        self._count(accepted, ratio == -math.inf)
         return report(ratio, accepted)
 
     def _check_batch(self, s: Tensor, a: Tensor, target: Tensor, penalty: Tensor | None) -> None:
@@ -240,7 +246,13 @@ class GaussNewton(torch.optim.Optimizer):
         proposed = lr * change
         change = self._project(blocks, proposed)
         predicted = before - objective(delta - change, blocks)
+        if self.param_groups[0].get("unsolved"):
+            after = self._mpc.solve(s[:FIRST], a[:FIRST], solution.active[:FIRST])
+            if not (after.solved | (root[:FIRST] == 0)).all():
+                return -math.inf
         after = self._mpc.solve(s, a, warm_start=solution.active)
+        if not (after.solved | (root == 0)).all():
+            return -math.inf
         actual = root * torch.where(root > 0, after.value - solution.value, 0)
         decrease = before - objective(delta - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
@@ -286,6 +298,22 @@ class GaussNewton(torch.optim.Optimizer):
                 group["damping"] = min(RISE * group["damping"], MAX_DAMPING)
             elif ratio > GOOD:
                 group["damping"] = max(FALL * group["damping"], self._least_damping)
+
+    def _count(self, accepted: bool, unsolved: bool) -> None:
+        """Count rejections in a row, and warn of the fifth; ``unsolved`` if a QP was."""
+        rejected = 0 if accepted else self.param_groups[0].get("rejected", 0) + 1
+        for group in self.param_groups:
+            group |= {"rejected": rejected, "unsolved": unsolved}
+        if rejected == STALLED:
+            got = f"{STALLED} steps in a row that were taken back, because "
+            got += "they left QPs unsolved" if unsolved else "they raised the TD errors"
+            remedy = (
+                "Theta stays, and learning may stall: make hard rows soft, learn less of theta "
+                "(constraint=fixed in train.py), keep C nearer to its model (constraint=deviation) "
+                "or take a larger batch."
+            )
+            error = QPError.expected("GaussNewton", got, "steps that are accepted", remedy)
+            warnings.warn(str(error), RuntimeWarning, stacklevel=5)
 
     def _free_C(self) -> Tensor | None:
         """Return the parameter of C if it is learned, free and not frozen."""
