@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.control.controller import Controller
     from torch_qpmpc.control.linear_mpc import LinearMPC
     from torch_qpmpc.export.export import CompiledPolicy, export_c
+    from torch_qpmpc.export.fmu import export_fmu
     from torch_qpmpc.identification.identification import identify
     from torch_qpmpc.identification.reading import read_log
     from torch_qpmpc.learning.closed_loop import improve
@@ -54,6 +55,7 @@ __all__ = [
     "SystemIdentificationPenalty",
     "ThetaNetwork",
     "export_c",
+    "export_fmu",
     "identify",
     "identify_blended",
     "improve",
@@ -87,6 +89,7 @@ if not TYPE_CHECKING:
         "ThetaNetwork": "torch_qpmpc.learning.theta_network:ThetaNetwork",
         "envs": "torch_qpmpc.envs:",
         "export_c": "torch_qpmpc.export.export:export_c",
+        "export_fmu": "torch_qpmpc.export.fmu:export_fmu",
         "identify": "torch_qpmpc.identification.identification:identify",
         "identify_blended": "torch_qpmpc.mpc.blended:identify_blended",
         "improve": "torch_qpmpc.learning.closed_loop:improve",
@@ -102,7 +105,7 @@ if not TYPE_CHECKING:
         return globals()[name]
 
     def __dir__() -> list[str]:
-        return sorted(globals().keys() | _LAZY)
+        return sorted({*__all__, "envs", "__version__"})
 
 
 #: Module and length of an episode of each environment.

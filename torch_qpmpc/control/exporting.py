@@ -6,7 +6,7 @@ import ctypes
 import math
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -20,7 +20,8 @@ from torch_qpmpc.control.simulation import at_rest, centre, closed_loop, last_kn
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
-from torch_qpmpc.export.library import FLAGS, compiled, compiler
+from torch_qpmpc.export.fmu import Variable, write_fmu
+from torch_qpmpc.export.library import FLAGS, compiled, compiler, required_compiler
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
@@ -136,10 +137,10 @@ def export_controller(
     memory: Memory,
     folder: str | Path,
     *,
-    dtype: str,
     name: str,
-    max_iterations: int | None,
-    storage: str,
+    dtype: str = "float64",
+    max_iterations: int | None = None,
+    storage: str = "fast",
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
     check_name(name)
@@ -189,6 +190,50 @@ def export_controller(
         len(loop.u),
         None if difference is None else float(difference.max()),
     )
+
+
+def export_controller_fmu(
+    law: Law, memory: Memory, path: str | Path, name: str, **options: Any
+) -> ControllerExport:
+    """Write a controller as an FMU; see `Controller.export_fmu`."""
+    required_compiler()
+    with tempfile.TemporaryDirectory() as folder:
+        report = export_controller(law, memory, folder, name=name, **options)
+        texts = {file.name: file.read_text(encoding="utf-8") for file in report.files}
+    file = write_fmu(path, name, texts, _variables(law, memory), law.design.plant.dt or 1.0)
+    return replace(report, files=(file,))
+
+
+def _variables(law: Law, memory: Memory) -> list[Variable]:
+    """Return the variables of a controller's FMU, in the order of ``fmu.c``."""
+    design, plant = law.design, law.design.plant
+    outputs, inputs, stages = plant.outputs, plant.inputs, design.horizon + 1
+    aims = stages if design.references == "preview" else 0  # a number in place of a vector
+    known, held = last_known(design, memory), np.full(stages, np.nan)
+    r = memory.r[-1] if len(memory.r) else centre(design, known)
+    none = np.full(len(outputs), np.nan)
+    kinds = [
+        ("y.", "input", outputs, none, 0, "measured; NaN if missing"),
+        ("r.", "input", outputs, r, aims, "set-point"),
+        ("known.", "input", plant.known, known, stages, "known, by stage"),
+        ("applied.", "input", inputs, memory.u, 0, "applied in manual mode"),
+        ("last.", "parameter", inputs, memory.u, 0, "applied before the start"),
+        ("u.", "output", inputs, memory.u, 0, "input of the plant"),
+    ]
+    for names, bounds in ((outputs, design.y_bounds), (inputs, design.u_bounds)):
+        sides = zip(("lower.", "upper."), bounds, strict=True)
+        kinds += [(side, "constant", names, limits, 0, "bound") for side, limits in sides]
+    variables = []
+    for prefix, causality, names, values, rows, about in kinds:
+        for name, value in zip(names, values, strict=True):
+            start = np.append(value, held[1:]) if rows else value  # a NaN holds the stage before
+            variables.append(
+                Variable(prefix + name, causality, start, about, plant.units.get(name))
+            )
+    rests = memory.rest[0] is not None, "at the start the plant rests with y and last"
+    manual = False, "take note of the applied inputs, in place of a step"
+    flags = Variable("manual", "input", *manual), Variable("rests", "parameter", *rests)
+    return [*variables, *flags]
 
 
 def undetermined(mpc: LinearMPC) -> str:

@@ -139,22 +139,31 @@ class Library:
         return Steps(u, codes, *(info[name] for name in self._info.names or ()))
 
 
+def built(files: Mapping[str, str], flags: Sequence[str], target: Path) -> Path:
+    """Compile files as C, also with a compiler of C++, into the library ``target``.
+
+    Raises:
+        QPError: there is no compiler, or it fails.
+    """
+    command, folder = required_compiler(), target.parent
+    for file, text in files.items():
+        (folder / file).write_text(text, encoding="utf-8")
+    sources = [str(folder / file) for file in files if file.endswith(".c")]
+    line = [*command, *flags, f"-I{folder}", "-o", str(target), "-x", "c", *sources]
+    try:
+        ended = subprocess.run(line, capture_output=True, text=True, check=False)
+    except OSError as error:
+        raise QPError.expected("compiler", f"{error}", "a command that runs") from error
+    if ended.returncode:
+        got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
+        raise QPError.expected("compiler", got, "a compiled policy")
+    return target
+
+
 def compiled(files: Mapping[str, str], flags: Sequence[str]) -> ctypes.CDLL:
-    """Compile files as C, also with a compiler of C++, and load them."""
-    command = required_compiler()
+    """Compile files as `built` does, and load them."""
     with tempfile.TemporaryDirectory() as folder:
-        for file, text in files.items():
-            (Path(folder) / file).write_text(text, encoding="utf-8")
-        target = Path(folder) / "policy.so"
-        sources = [str(Path(folder) / file) for file in files if file.endswith(".c")]
-        line = [*command, *flags, f"-I{folder}", "-o", str(target), "-x", "c", *sources]
-        try:
-            ended = subprocess.run(line, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise QPError.expected("compiler", f"{error}", "a command that runs") from error
-        if ended.returncode:
-            got = f"an error of {' '.join(command)}: {ended.stderr.strip()[-500:]}"
-            raise QPError.expected("compiler", got, "a compiled policy")
+        target = built(files, flags, Path(folder) / "policy.so")
         try:
             return ctypes.CDLL(str(target))
         except OSError as error:
