@@ -38,7 +38,7 @@ def test_a_qp_a_controller_and_the_ids_import_nothing_heavy():
 
 def test_every_public_name_is_there_and_listed():
     names = {*torch_qpmpc.__all__, "envs"}
-    assert names <= set(dir(torch_qpmpc))
+    assert {*dir(torch_qpmpc)} == names | {"__version__"}
     for name in names:
         value = getattr(torch_qpmpc, name)
         assert value is vars(torch_qpmpc)[name], f"{name} is looked up twice"

@@ -13,6 +13,7 @@ import torch
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.qp.pipeline import solve
 
 A = np.array([[1.0, 0.1], [0.0, 0.8]])
 B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
@@ -214,3 +215,16 @@ def test_a_healthy_loop_needs_no_refinement():
     assert log.solves == 80
     assert log.refined == log.fallback == log.unsolved == 0
     assert log.recalled > 70
+
+
+def test_the_first_step_finds_everything_factored(monkeypatch):
+    """So after a reset and a redesign; compiled code follows from the same steps."""
+    counted, own = [], solve.AtRest.__init__
+    monkeypatch.setattr(solve.AtRest, "__init__", lambda *args: (counted.append(1), own(*args))[1])
+    controller = qm.Controller(integrator())
+    for change in (controller.reset, lambda: controller.redesign(dR=0.2)):
+        counted.clear()
+        change()
+        assert len(counted) == 2, "the plan's and the target's"
+        controller.step([0.0], [3.0])
+        assert len(counted) == 2

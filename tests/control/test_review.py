@@ -11,7 +11,6 @@ import torch
 
 import torch_qpmpc as qm
 from torch_qpmpc import QPError
-from torch_qpmpc.control import review
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.export.tables import make_tables
@@ -22,14 +21,6 @@ INVERSE = ([[0.9, 0.0], [0.0, 0.5]], [[1.0], [1.0]], [[0.3, -1.2]])
 DEAD_TIME = (np.eye(6, k=1), np.eye(6)[:, -1:], np.eye(6)[:1])
 TWO_OUTPUTS = (np.diag([0.9, 0.5]), np.eye(2))
 TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
-#: Steps of the loop that probes the weights and the QP.
-PROBED = review.PROBED
-
-
-@pytest.fixture(autouse=True)
-def quick_probe(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Probe by one set-point, except in the tests of what the probe tells."""
-    monkeypatch.setattr(review, "PROBED", review.HELD)
 
 
 def controller(model, horizon=10, filtered=None, r=None, **options):
@@ -106,33 +97,24 @@ MISTAKES = {
         lambda gamma: {"gamma": float(gamma)},
     ),
     "a filter that trusts all": (
-        (INTEGRATOR, fast(noise=1e-3, drift=1.0)),
-        ("margin", r"Slow the filter down, by qm\.Controller\(\.\., noise={'y1': (1)}\)\."),
+        (INTEGRATOR, fast(noise=0.1, drift=1.0)),
+        (
+            "margin",
+            r"Slow the filter down, as by .*, noise={'y1': (1)}\), or raise dR tenfold\.",
+        ),
         lambda noise: fast(noise={"y1": float(noise)}, drift=1.0),
-    ),
-    "weights far apart": (
-        (TWO_INPUTS, {"dR": 1e-9}),
-        ("condition", r"Raise the weights of the inputs to R=(0\.007)\."),
-        weighted,
     ),
     "inputs that set-points leave free, without a weight": (
         (TWO_INPUTS, {}),
         ("terminal weight", r"Weight all inputs by R: several of them hold the same outputs\."),
         lambda: {"R": 0.01},
     ),
-    "a weight that does not matter": (
-        (TWO_OUTPUTS, {"Q": [1.0, 1e-9]}),
-        ("weights", r"Raise Q of y2 to (0\.001), or leave it out: y2 does not matter\."),
-        lambda weight: {"Q": [1.0, float(weight)]},
-    ),
 }
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake, monkeypatch):
+def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
     (model, options), (name, remedy), change = MISTAKES[mistake]
-    if name == "weights":
-        monkeypatch.setattr(review, "PROBED", PROBED)
     design = {"model": model, **options}
     fault = made(**design)[name]
     assert not fault.ok
@@ -170,9 +152,14 @@ def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
 def test_a_filter_that_takes_noise_for_disturbances_is_named_and_its_remedy_mends_it():
     fault = made(NOISY)["noise"]
     assert not fault.ok
-    words = re.fullmatch(r"Slow .*drift={'(disturbance of y1)': (.*)}\)\.", fault.remedy)
-    assert words, fault.remedy
-    assert made(NOISY, filtered={"drift": {words[1]: float(words[2])}})["noise"].ok
+    filtered = {}
+    for _ in range(8):  # tenfold each time
+        words = re.fullmatch(r"Slow .*drift={'(disturbance of y1)': (.*)}\), or .*", fault.remedy)
+        assert words, fault.remedy
+        filtered = {"drift": {words[1]: float(words[2])}}
+        if (fault := made(NOISY, filtered=filtered)["noise"]).ok:
+            break
+    assert fault.ok
     assert made(replace(NOISY, A=np.array([[1.1]])))["noise"].ok, "it must act"
 
 
@@ -185,12 +172,14 @@ def loop(model, **options):
 
 
 @pytest.mark.parametrize("model", [LAG, INTEGRATOR, DEAD_TIME])
-def test_a_sound_design_has_no_fault(model, monkeypatch):
-    monkeypatch.setattr(review, "PROBED", PROBED)
+def test_a_sound_design_has_no_fault(model):
     found = made(model, 15, r=[0.5])
     assert found.faults == []
-    assert len(found.findings) == 13
-    assert str(found).startswith("0 faults in 13 findings\nok    cost: smallest eigenvalue on the")
+    assert len(found.findings) == 10
+    assert str(found).startswith(
+        "0 faults in 10 findings\nok    cost: The eigenvalues of the plan's"
+    )
+    assert all(x.text[0].isupper() and x.text[-1] == "." for x in found.findings)
 
 
 def test_findings_are_about_the_last_known_signals_or_those_passed():
@@ -198,12 +187,38 @@ def test_findings_are_about_the_last_known_signals_or_those_passed():
     controller = qm.Controller(qm.LinearMPC(LAG, 12, Q=1.0, dR=0.1, **options))
     controller.reset(y=[20.0], u=[2.0], known=[10.0])
     found = controller.review(r=[35.0])
-    assert found["set-points"].text == "at rain 10; y1 reaches [10, 35]"
+    assert found["set-points"].text == "At rain 10 the outputs reach y1 10 to 35."
     assert found.faults == []
     (fault,) = controller.review(r=[35.0], known=[5.0]).faults
     assert fault.remedy == "Set y1 to 30, not 35, or widen u_bounds of u1."
     controller.reset()
-    assert controller.review()["set-points"].text.startswith("at rain (not known, assumed) 0;")
+    assert controller.review()["set-points"].text.startswith("At rain 0 (assumed) the outputs")
+
+
+def test_a_log_s_means_are_assumed_and_offsets_below_its_noise_are_no_fault():
+    rng, y = np.random.default_rng(0), np.zeros(400)
+    u, d = rng.uniform(0, 4, (2, 400))
+    for k in range(399):
+        y[k + 1] = 0.8 * y[k] + 0.5 * u[k] + 0.5 * d[k] + 0.2 * rng.normal()
+    log = {"T": y, "q": u, "d": d + 6.0}
+    model = qm.identify(qm.read_log(log, outputs=["T"], inputs=["q"], known=["d"]), horizon=8)
+    mpc = qm.LinearMPC(model, 8, Q=1.0, dR=0.1, u_bounds=(0.0, 4.0))
+    found = (controller := qm.Controller(mpc)).review()["set-points"]
+    assert found.text.startswith(f"At d {log['d'][:-1].mean():.4g} (assumed) the outputs")
+    top = found.numbers["T reaches"][1]
+    assert controller.review(r=[top + 0.15])["set-points"].ok
+    assert not controller.review(r=[top + 0.4])["set-points"].ok
+
+
+def test_outputs_reach_what_the_zones_of_others_leave():
+    """y2, without a weight, moves with y1."""
+    model = ([[0.9]], [[0.5]], [[1.0], [0.5]])
+    design = {"Q": [1.0, 0.0], "dR": 0.1, "u_bounds": (-1.0, 1.0)}
+    for zone, expected in ((None, [-5, 5]), ((-1.0, 0.5), [-2, 1]), ((4.0, 5.0), [-5, 5])):
+        mpc = qm.LinearMPC(model, 10, **design, y_bounds={"y2": zone or (None, None)})
+        numbers = qm.Controller(mpc).review()["set-points"].numbers
+        assert np.allclose(numbers["y1 reaches"], expected)
+        assert np.allclose(numbers["y2 reaches"], [-2.5, 2.5])
 
 
 COUPLED = (np.diag([0.9, 0.8]), np.array([[0.5, 0.1], [0.13, 0.47]]))
@@ -243,7 +258,8 @@ def test_known_signals_that_no_input_balances_are_a_fault():
     controller = qm.Controller(qm.LinearMPC(([[1.0]], [[0.5]]), 10, Q=1.0, dR=0.1, **options))
     finding = controller.review(known={"d": [5.0]})["set-points"]
     assert not finding.ok
-    assert finding.remedy.startswith("No input within its bounds holds the plant")
+    assert finding.text == "At d 5 the plant rests with no input within its bounds."
+    assert finding.remedy == "Widen u_bounds."
     assert controller.review(known={"d": [0.2]})["set-points"].ok
 
 
@@ -251,18 +267,7 @@ def test_known_signals_that_no_input_balances_are_a_fault():
 def test_an_integrator_responds_as_early_with_any_horizon(horizon):
     model = ([[1.0, 1.0], [0.0, 1.0]], [[0.5], [1.0]], [[1.0, 0.0]])
     mpc = qm.LinearMPC(model, horizon, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
-    numbers = qm.Controller(mpc).review()["horizon"].numbers
-    assert numbers["steps until y1 responds in its direction"] == 1
-
-
-def test_gains_are_those_of_steps():
-    options = {"E": [[0.1, 0.0]], "known": ["rain", "price"]}
-    gains = made(LAG, **options)["gains"].numbers
-    assert np.allclose(gains["y1 per unit of u1, rain in steady state"], [5.0, 1.0])
-    (after,) = made(INTEGRATOR)["gains"].numbers.items()
-    assert after[0] == "y1 per unit of u1 after 10 steps"
-    step = np.cumsum([0.8**k for k in range(10)])
-    assert np.allclose(after[1], 0.1 * step[:-1].sum())
+    assert qm.Controller(mpc).review()["horizon"].numbers["y1"] == 1
 
 
 def test_the_noise_of_a_fit_is_no_response():
@@ -270,7 +275,7 @@ def test_the_noise_of_a_fit_is_no_response():
     B = np.hstack((DEAD_TIME[1], 1e-3 * np.ones((6, 1))))
     B[0, 0] = 0.01
     text = made((DEAD_TIME[0], B, DEAD_TIME[2]), R=0.01)["horizon"].text
-    assert text == "steps until y1 responds in its direction 6; horizon 10"
+    assert text == "Steps of the horizon 10, until an input moves y1 6."
 
 
 def test_a_learned_cost_that_is_indefinite_is_named():
@@ -321,45 +326,13 @@ def test_the_margin_is_that_of_the_loop_s_gain():
     assert radius(3.0) > 1
 
 
-def test_a_filter_that_never_settles_is_no_remedy(monkeypatch):
-    """Its margin is that of a loop that hardly reacts."""
-    design = {"model": INTEGRATOR, **fast(noise=1e-3, drift=1.0)}
-    assert made(**design)["margin"].remedy.startswith("Slow the filter down")
-    monkeypatch.setattr(review, "PATIENCE", 0)
-    assert made(**design)["margin"].remedy == "Raise dR tenfold."
-
-
-def test_shares_are_the_gradient_of_the_loop_s_cost():
-    """Those of central differences, as the inputs are nearly optimal for each weight."""
-
-    def cost(dR):
-        mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=[1.0, 0.5], R=0.1, dR=dR, u_bounds=(-3.0, 3.0))
-        run = qm.Controller(mpc).simulate(steps=60, r=[1.0, -1.0])
-        return run.cost.sum(), (np.diff(run.u[:, 0], prepend=0.0) ** 2).sum()
-
-    h, dR = 1e-3, np.array([0.5, 0.3])
-    (up, _), (down, _) = cost(dR * [1 + h, 1]), cost(dR * [1 - h, 1])
-    whole, moves = cost(dR)
-    assert abs((up - down) / (2 * h) / whole - dR[0] * moves / whole) < 0.01
-    assert (up - down) / (2 * h) / whole > 0.05
-
-
-def test_a_negative_share_of_coupled_weights_is_no_fault(monkeypatch):
-    monkeypatch.setattr(review, "PROBED", PROBED)
-    Q = [[1.0, -0.9], [-0.9, 1.0]]
-    mpc = qm.LinearMPC(TWO_OUTPUTS, 20, Q=Q, R=0.1, u_bounds=(-3.0, 3.0), y_bounds=(-1.0, 1.0))
-    weights = qm.Controller(mpc).review()["weights"]
-    assert min(weights.numbers.values()) < 0
-    assert weights.ok
-
-
 def test_outputs_whose_bounds_the_export_refuses_are_a_fault(tmp_path):
     model = (np.diag([0.9, 0.5]), np.eye(2), np.array([[1.0, 1.0], [0.0, 1.0]]))
     design = {"R": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": {"y2": (-1.0, 1.0)}}
     refused = qm.Controller(qm.LinearMPC(model, 5, Q=[1.0, 0.0], **design))
     found = refused.review()["C code"]
     assert not found.ok
-    assert found.numbers["outputs whose bounds export_c refuses"] == "y2"
+    assert found.text.startswith("export_c refuses the bounds of y2: no output with a weight")
     assert found.remedy == "Give y2 a small weight, or no bounds."
     with pytest.raises(QPError, match=r"^controller: got bounds of y2, .* Give y2 a small"):
         refused.export_c(tmp_path)

@@ -10,14 +10,16 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_kind
-from torch_qpmpc.control.exporting import ControllerExport, export_controller
-from torch_qpmpc.control.law import Law, Memory, Outcome
+from torch_qpmpc.control.explain import Explanation, explain
+from torch_qpmpc.control.exporting import ControllerExport, export_controller, export_controller_fmu
+from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.learning import LearningReport, improve, learn
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
-from torch_qpmpc.control.simulation import Run, simulate
+from torch_qpmpc.control.simulation import Run, ready, simulate
 from torch_qpmpc.control.state_space import Array, read_measured, read_row
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
 
@@ -46,13 +48,6 @@ class Controller:
             to noise rejects disturbances faster and passes on more noise.
 
     Attributes:
-        mpc: the MPC.
-        observer: the `Observer`.
-        max_plausible: the largest sizes of outputs and set-points, ``(n_y,)``, and of known
-            signals, ``(n_d,)``; larger values count as errors: see `torch_qpmpc.control.observer`.
-        x, w, u: the estimates of x and w, and the last input.
-        known: the known signals of the last step or reset, ``(n_d,)``, None before.
-        r: the set-points of the last step, without rows before the first.
         status: the `Outcome` of the last step, SOLVED before the first.
         p: the input of the last plan, ``(n_p,)``.
         target: the `Target` of the last plan, None before the first; with a preview, of all stages.
@@ -74,7 +69,7 @@ class Controller:
 
     def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
-        self._law = Law.of(mpc, noise, drift)
+        self._law = ready(Law.of(mpc, noise, drift))
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
@@ -93,7 +88,7 @@ class Controller:
         Raises:
             QPError: an argument is invalid.
         """
-        self._law = law = self._law.renewed()
+        self._law = law = ready(self._law.renewed())
         memory = law.begun(None if u is None else read_row("u", u, law.design.plant.inputs))
         memory = memory._replace(r=self.r)
         y = None if y is None else law.read("y", y, 1)[0]
@@ -110,6 +105,7 @@ class Controller:
         self.status = Outcome.SOLVED
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.plan.n_p)
+        self._now: Signals | None = None
 
     def __repr__(self) -> str:
         """Return its design and the last input."""
@@ -127,7 +123,7 @@ class Controller:
 
     @property
     def max_plausible(self) -> tuple[Array, Array]:
-        """The largest sizes of outputs and of known signals."""
+        """The largest sizes of outputs and set-points, and of known signals, that are no errors."""
         return self._law.max_plausible
 
     @property
@@ -178,7 +174,8 @@ class Controller:
         ahead = law.read_known(known, rows, sane=False)
         set_points = law.read_set_points(r, rows, self._memory.r, sane=False)
         measured = read_measured("y", y, law.design.plant.outputs)
-        move = law.step(self._memory, measured, set_points, ahead)
+        self._now = Signals(measured, set_points, ahead)
+        move = law.step(self._memory, *self._now)
         self._memory, self.status = move.memory, move.status
         if move.target is not None and move.p is not None:
             self.target, self.p = move.target, move.p
@@ -204,6 +201,7 @@ class Controller:
         applied = read_measured("u", u, law.design.plant.inputs)
         measured = read_measured("y", y, law.design.plant.outputs)
         self._memory, self.status = law.observed(self._memory, measured, applied, ahead)
+        self._now = None
 
     def redesign(self, **changes: Any) -> None:
         """Change weights, bounds and the filter between two steps; the estimates stay.
@@ -229,9 +227,9 @@ class Controller:
             >>> controller.step([0.0], r=[5.0])
             array([0.2, 0.3])
         """
-        self._law = self._law.redesigned(**changes)
+        self._law = ready(self._law.redesigned(**changes))
         u = np.clip(self.u, *self.mpc.design.u_bounds)
-        self._memory = self._memory._replace(u=u)
+        self._memory, self._now = self._memory._replace(u=u), None
 
     def save(self, path: str | Path) -> None:
         """Write this controller, its estimates and its last input to ``path``, without code.
@@ -342,7 +340,7 @@ class Controller:
         law = self._law.renewed()
         report, candidate = learn(law, self._memory, source, transitions, **options)
         if report.accepted:
-            self._law = candidate
+            self._law = ready(candidate)
             steps = len(self._law.observer.gains) - 1  # from rest
             self._start(self._memory._replace(e=None, steps=steps))
         return report
@@ -364,21 +362,21 @@ class Controller:
             QPError: an argument is invalid, the log determines no model, or the MPC learns nothing.
         """
         report, law = improve(self._law.renewed(), self._memory, log, r, spread, **options)
-        self._law = law if report.kept else self._law
+        if report.kept:
+            self._law, self._now = ready(law), None
         return report
 
     def review(self, r: Any = None, known: Any = None) -> Review:
-        """Return findings about this design: numbers, and a remedy for each fault.
+        """Return findings about this design: sentences, and a remedy for each fault.
 
-        They cover the cost, the terminal weight, the gains, the horizon, the disturbances, the
-        scaling of signals, hard bounds that can leave no plan, the reach of set-points, the QP's
-        condition, the loop without active bounds (its stability, margin and offset), the shares of
-        weights in the cost of a closed loop, and the C code.
+        They cover the cost, the terminal weight, the horizon, the disturbances, hard bounds that
+        can leave no plan, the reach of set-points, the loop without active bounds (its stability,
+        margin, offset and cost under the log's noise), and the C code.
 
         Args:
             r: set-points that the inputs must reach, by default the last step's.
             known: a row of known signals that are held, by default the last step's or reset's, else
-                zero. The finding about set-points shows them.
+                the means of the model's log, else zero. The finding about set-points shows them.
 
         Raises:
             QPError: r or known is invalid.
@@ -393,6 +391,27 @@ class Controller:
             ('set-points', 'Set y1 to 5, not 7, or widen u_bounds of u1.')
         """
         return review(self._law.renewed(), self._memory, r, known)
+
+    def explain(self) -> Explanation:
+        """Return why the last step did what it did, in names and units; ``print`` shows it.
+
+        It has the plan, the bounds that hold it back, the disturbances, and what is in reach.
+
+        Raises:
+            QPError: the last call was no `step`.
+
+        Example:
+            >>> import torch_qpmpc as qm
+            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+            >>> controller = qm.Controller(mpc)
+            >>> u = controller.step([0.0], r=[4.0])
+            >>> controller.explain().limits[0].signal
+            'u1'
+        """
+        if self._now is None:
+            got, want = "no step since the last change", "a step to explain"
+            raise QPError.expected("controller", got, want, "Call step first.")
+        return explain(self._law, self._memory, self.status, self._now, self.p)
 
     def export_c(
         self,
@@ -424,3 +443,21 @@ class Controller:
         return export_controller(
             law, self._memory, folder, max_iterations=max_iterations, **options
         )
+
+    def export_fmu(
+        self, path: str | Path, *, name: str = "policy", **options: Any
+    ) -> ControllerExport:
+        """Write this controller as an FMU of FMI 3.0 for co-simulation, with sources and a library.
+
+        With an output T, an input q and a known signal d, its inputs are ``y.T`` (NaN if missing),
+        ``r.T`` and ``known.d``, a vector of its N + 1 stages, where a NaN holds the stage before;
+        its outputs are ``u.q`` and ``status``. While ``manual`` is true, it records ``applied.q``
+        as `observe` does. The parameter ``last.q`` is the input before the start, and with
+        ``rests`` it starts as by ``reset(y, u, known)``. ``lower.q`` and ``upper.q`` are bounds. A
+        step takes the model's dt, or a second. ``name`` is the model's identifier; the options are
+        ``max_iterations`` and ``storage`` of `export_c`, whose report it returns for ``path``.
+
+        Raises:
+            QPError: no C compiler is installed, or as in `export_c`.
+        """
+        return export_controller_fmu(self._law.renewed(), self._memory, path, name, **options)

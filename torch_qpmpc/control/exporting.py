@@ -208,12 +208,11 @@ def _variables(law: Law, memory: Memory) -> list[Variable]:
     """Return the variables of a controller's FMU, in the order of ``fmu.c``."""
     design, plant = law.design, law.design.plant
     outputs, inputs, stages = plant.outputs, plant.inputs, design.horizon + 1
-    aims = stages if design.references == "preview" else 0  # a number in place of a vector
+    aims = stages if design.references == "preview" else 0
     known, held = last_known(design, memory), np.full(stages, np.nan)
     r = memory.r[-1] if len(memory.r) else centre(design, known)
-    none = np.full(len(outputs), np.nan)
     kinds = [
-        ("y.", "input", outputs, none, 0, "measured; NaN if missing"),
+        ("y.", "input", outputs, [np.nan] * len(outputs), 0, "measured; NaN if missing"),
         ("r.", "input", outputs, r, aims, "set-point"),
         ("known.", "input", plant.known, known, stages, "known, by stage"),
         ("applied.", "input", inputs, memory.u, 0, "applied in manual mode"),
@@ -227,13 +226,12 @@ def _variables(law: Law, memory: Memory) -> list[Variable]:
     for prefix, causality, names, values, rows, about in kinds:
         for name, value in zip(names, values, strict=True):
             start = np.append(value, held[1:]) if rows else value  # a NaN holds the stage before
-            variables.append(
-                Variable(prefix + name, causality, start, about, plant.units.get(name))
-            )
+            unit = plant.units.get(name)
+            variables.append(Variable(prefix + name, causality, start, about, unit))
     rests = memory.rest[0] is not None, "at the start the plant rests with y and last"
     manual = False, "take note of the applied inputs, in place of a step"
-    flags = Variable("manual", "input", *manual), Variable("rests", "parameter", *rests)
-    return [*variables, *flags]
+    variables.append(Variable("manual", "input", *manual))
+    return [*variables, Variable("rests", "parameter", *rests)]
 
 
 def undetermined(mpc: LinearMPC) -> str:

@@ -61,13 +61,10 @@ class Signals(NamedTuple):
 
 
 class Outcome(IntEnum):
-    """What a step has come to; functions in C return the same numbers.
+    """What a step has come to: ``SOLVED, LIMIT, INFEASIBLE, INVALID`` or ``MISSING``.
 
-    ``SOLVED``: all outputs are seen, and the input is optimal. ``MISSING``: so it is, for estimates
-    that lack the correction by a missing output. Otherwise the last input stays, within its bounds:
-    ``LIMIT`` without a certified plan, ``INFEASIBLE`` if no plan satisfies the hard bounds, and
-    ``INVALID`` if a set-point or known signal is not finite or above `Law.max_plausible`, or an
-    output is missing before there are estimates.
+    Functions in C return the same numbers. A valid signal is finite and not above
+    `Law.max_plausible`. An input that stays is clipped into its bounds.
     """
 
     SOLVED = 0
@@ -75,6 +72,20 @@ class Outcome(IntEnum):
     INFEASIBLE = 2
     INVALID = 3
     MISSING = 4
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def explanation(self) -> str:
+        """The outcome in words."""
+        return (
+            "All outputs are measured, and the input is optimal.",
+            "The solver certified no plan: the last input stays.",
+            "No plan keeps the hard bounds: the last input stays.",
+            "A set-point, known signal or first output is invalid: the last input stays.",
+            "Predictions stand for missing outputs, and the input is optimal for them.",
+        )[self]
 
 
 class Move(NamedTuple):

@@ -224,9 +224,25 @@ class _Model:
         return self._model.C @ self._x, {}
 
 
+def ready(law: Law) -> Law:
+    """Return a law with factored QPs and compiled code, by steps with active bounds and without."""
+    memory, rows, y = (
+        law.begun(rests=True),
+        (law.design.horizon + 1, 1),
+        middle(law.design.y_bounds),
+    )
+    known = np.tile(last_known(law.design, memory), rows)
+    for r in (y + 100.0 * law.design.usual, y):
+        memory = law.step(memory, y, np.tile(r, rows), known).memory
+    return law
+
+
 def last_known(design: Design, memory: Memory) -> Array:
-    """Return the known signals of the last step or reset, `Design.nominal` before, ``(n_d,)``."""
-    return design.nominal if memory.known is None else memory.known
+    """Return the last known signals ``(n_d,)``: before any the log's means, or nominal ones."""
+    if memory.known is not None:
+        return memory.known
+    names = zip(design.plant.known, design.nominal, strict=True)
+    return np.array([design.plant.means.get(name, x) for name, x in names])
 
 
 def centre(design: Design, known: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import torch
 
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
@@ -32,6 +33,7 @@ class StateSpace:
         units: units by name, where known.
         noise: L ``(n, n_y)`` and S ``(n_y, n_y)`` of an identification, see `Innovations`.
         visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
+        means: the means of its inputs and known signals, by name.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -49,6 +51,7 @@ class StateSpace:
     units: Mapping[str, str] = field(default_factory=dict)
     noise: tuple[Array, Array] | None = None
     visited: tuple[Array, Array] | None = None
+    means: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -71,6 +74,11 @@ class StateSpace:
     def label(self, name: str) -> str:
         """Return ``name`` with its unit, as ``T [degC]``."""
         return f"{name} [{self.units[name]}]" if name in self.units else name
+
+    def quantity(self, name: str, x: float) -> str:
+        """Return a signal's name and value with its unit, as ``T 21 degC``."""
+        value = "missing" if np.isnan(x) else f"{x:.4g} {self.units.get(name, '')}"
+        return f"{name} {value}".rstrip()
 
 
 def read_model(
@@ -105,13 +113,15 @@ def read_model(
         own = {"E": E, "dt": dt, "inputs": inputs, "outputs": outputs, "known": known or None}
         _check_absent("a StateSpace has its own", **own)
         return model
-    offset, units, noise, states = None, {}, None, None
+    offset, units, noise, states, means = None, {}, None, None, {}
     if isinstance(model, Identified):
         _check_absent("the identification has its own", E=E)
         A, B, E, offset, C, L, S, *_ = model.model
         noise, states = (L, S), visited(model.model, model.log.trajectories)
         log, dt = model.log, _own_dt(dt, model.log.dt)
-        units = dict(log.units)
+        units, signals = dict(log.units), (*log.inputs, *log.known)
+        rows = torch.cat([torch.hstack((x.u, x.d)) for x in log.trajectories])
+        means = dict(zip(signals, rows.nanmean(0).tolist(), strict=True))
         inputs, outputs, known = inputs or log.inputs, outputs or log.outputs, known or log.known
         if not {*known} >= {*log.known}:
             want = f"all known signals of the log, {', '.join(log.known)}"
@@ -145,7 +155,7 @@ def read_model(
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
-    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states)
+    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states, means)
 
 
 def _check_absent(why: str, **arguments: Any) -> None:

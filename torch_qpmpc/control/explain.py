@@ -1,0 +1,136 @@
+"""`Controller.explain`: why the last step did what it did, in the user's names and units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_qpmpc.control.design import Design
+from torch_qpmpc.control.disturbance import PREFIX
+from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
+from torch_qpmpc.control.review import Setting, set_points
+from torch_qpmpc.control.simulation import Run
+from torch_qpmpc.control.state_space import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: A multiplier this small, relative to a typical stage's cost for a usual deviation, is rounding.
+ACTIVE = 1e-6
+
+
+class Limit(NamedTuple):
+    """A bound that holds the plan back, what a unit more room saves, and its violation."""
+
+    signal: str
+    text: str
+    price: float
+    violation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The last step and its plan; ``print`` shows it, and ``plot`` draws the plan.
+
+    Of a ``design`` and its ``status`` it has in ``now`` measured outputs, set-points and known
+    signals; in ``u`` and ``y`` the plan's inputs ``(N, m)``, one row without one, and the outputs
+    after them; in ``limits`` what holds it back, dearest first; the estimated ``disturbances``; and
+    in ``reach`` which set-points are in reach, and what to do if r is not.
+    """
+
+    design: Design
+    status: Outcome
+    now: Signals
+    u: Array
+    y: Array
+    limits: tuple[Limit, ...]
+    disturbances: Mapping[str, float]
+    reach: str
+
+    def __str__(self) -> str:
+        plant = self.design.plant
+        lines = [f"{self.status}: {self.status.explanation}"]
+        for i, name in enumerate(plant.outputs):
+            aim = f", set-point {self.now.r[0, i]:.4g}" * bool(self.design.Q[i].any())
+            later = f", in {len(self.y)} steps {self.y[-1, i]:.4g}" if len(self.y) else ""
+            lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
+        for i, name in enumerate(plant.inputs):
+            shown = np.unique(np.linspace(1, len(self.u) - 1, 5).astype(int))
+            later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown if len(self.u) > 1)
+            lines.append(f"{plant.quantity(name, self.u[0, i])}{', then ' * bool(later)}{later}")
+        for name, x in self.disturbances.items():
+            unit = plant.units.get(name.removeprefix(PREFIX), "")
+            lines.append(f"{name} {x:.4g} {unit}".rstrip())
+        free = ["No bound holds the plan back."][: len(self.y)]
+        return "\n".join([*lines, *([x.text for x in self.limits] or free), self.reach])
+
+    def plot(self) -> Figure:
+        """Return a figure of the plan, with bounds and set-points."""
+        y, rows = np.vstack((self.now.y, self.y)), np.arange(len(self.y) + 1)
+        r, known = (x[np.minimum(rows, len(x) - 1)] for x in (self.now.r, self.now.known))
+        return Run(self.design, y, r, self.u[: len(self.y)], known[:-1], self.u, self.u[0]).plot()
+
+
+def explain(law: Law, memory: Memory, status: Outcome, now: Signals, p: Tensor) -> Explanation:
+    """Return what a step with the plan's input p has come to, from the memory after it."""
+    design, mpc, observer = law.design, law.mpc, law.observer
+    u, y, limits, known = memory.u[None], np.empty((0, len(design.Q))), (), now.known
+    if status in (Outcome.SOLVED, Outcome.MISSING):
+        plan = law.plans.solve(p.numpy()[None])
+        _, moved = mpc.plan.predicted(torch.from_numpy(plan.z[0]))
+        u = memory.u + (moved - moved[0]).numpy()
+        e, rows = memory.e, []
+        assert e is not None
+        for k in range(1, len(u) + 1):
+            rows.append(observer.H @ e)
+            e = observer.predicted(e, u[min(k, len(u) - 1)], known[k])
+        y = np.array(rows)
+        limits = _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
+    w = law.estimates(memory)[1]
+    valid = known[0] if np.isfinite(known[0]).all() else design.nominal
+    finding = set_points(Setting(mpc, w, valid), memory.r, False)
+    names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
+    reach = f"{finding.text} {finding.remedy}".rstrip()
+    return Explanation(design, status, now, u, y, limits, names, reach)
+
+
+def _limits(design: Design, lam: Array, y: Array, u: Array, known: Array) -> tuple[Limit, ...]:
+    """Return the bounds with multipliers ``lam`` of G's rows, dearest first."""
+    plant, N, none = design.plant, len(u), np.empty((len(design.plant.known), 0))
+    of_y, of_u = (design.rows(i, np.empty((x.shape[1], 0)), none)[-1] for i, x in enumerate((y, u)))
+    of_y = of_y[design.y_slack[of_y] > 0]
+    of_du = np.flatnonzero(np.isfinite(design.du_bounds).any(0))
+    n_y, width = len(of_y), len(of_y) + len(of_u) + len(of_du)
+    prices = np.append(lam[len(lam) - N * width - n_y :], np.zeros(width - n_y))
+    prices = prices.reshape(N + 1, width)  # the last stage has rows of outputs alone
+    prices[0, :n_y] = 0.0  # nothing moves the outputs of this step
+    bands, bounds = design.bounds_at(known[: N + 1])
+    u, of_input = np.vstack((u, u[-1:])), design.scaling.u
+    kinds = (
+        ("", plant.outputs, y, bands, design.usual, of_y),
+        ("", plant.inputs, u, bounds, of_input, of_u),
+        ("move of ", plant.inputs, np.full_like(u, np.nan), design.du_bounds, of_input, of_du),
+    )
+    rows: list[tuple[Any, ...]] = [(*kind, i) for *kind, places in kinds for i in places]
+    limits = []
+    for (word, names, x, sides, size, i), price in zip(rows, prices.T, strict=True):
+        for side, sign, bound in zip(("lower", "upper"), (-1, 1), sides, strict=True):
+            steps = np.flatnonzero(sign * price * size[i] > ACTIVE * design.typical)
+            if not len(steps):
+                continue
+            bound = np.broadcast_to(bound, x.shape)[steps, i]
+            over = float(np.nan_to_num((sign * (x[steps, i] - bound)).max()))
+            over, saved = over * bool(over > ACTIVE * size[i]), abs(price[steps]).sum()
+            unit = plant.units.get(names[i], "")
+            text = f"{word}{names[i]} is at its {side} bound {bound[0]:.4g} {unit}".rstrip()
+            text += f" in steps {steps[0]} to {steps[-1]}"
+            text += f", violated by up to {over:.3g}" * bool(over)
+            more = f"{unit or 'unit'} {'more' if sign > 0 else 'less'}"
+            text += f": one {more} would save {saved:.3g} of the cost."
+            limits.append(Limit(word + names[i], text, float(saved), over))
+    return tuple(sorted(limits, key=lambda limit: -limit.price))
