@@ -66,14 +66,14 @@ def loops(controller: qm.Controller) -> learning.ControlledPlant:
 def test_its_gradient_is_that_of_finite_differences(case):
     """Through the observer, the target and the QP, along random directions."""
     controller = made(case)
-    mpc, plant = controller.mpc, loops(controller)
+    mpc, plant = controller.mpc.plan, loops(controller)
 
     def cost() -> torch.Tensor:
         return _Loops(plant, 3, 1).run(mpc, 6).costs.mean()
 
     _Loops(plant, 3, 1).mean_cost(mpc, 6).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
-    for name, leaf in mpc.plan.coordinates().items():
+    for name, leaf in mpc.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:
             continue
         direction = torch.randn(leaf.shape, generator=generator).double() * leaf.detach().abs()
