@@ -118,6 +118,61 @@ def test_a_file_is_read_by_its_header(tmp_path, lines, steps):
     assert torch.allclose(read, torch.as_tensor(TABLE["T"].to_numpy()), rtol=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("sep", "decimal", "encoding"),
+    [(";", ",", "utf-8"), (";", ",", "cp1252"), (";", ".", "utf-8-sig"), ("\t", ",", "utf-8")],
+)
+def test_a_file_of_another_country_is_read(tmp_path, sep, decimal, encoding):
+    frame = room().rename(columns={"T": "T [°C]", "t": "t [h]"})
+    text = frame.to_csv(index=False, sep=sep, decimal=decimal)
+    (file := tmp_path / "room.csv").write_bytes(text.encode(encoding))
+    log = qm.read_log(file, **NAMES, time="t")
+    assert same(log, qm.read_log(frame, **NAMES, time="t"))
+    assert (log.units, log.dt, log.dt_unit) == ({"T": "°C"}, 0.25, "h")
+    assert str(log).startswith("59 steps, one step every 0.25 h: outputs T [°C]; inputs q;")
+
+
+@pytest.mark.parametrize("time", [None, "", "Unnamed: 0"])
+@pytest.mark.parametrize("kind", ["DatetimeIndex", "TimedeltaIndex", "PeriodIndex"])
+def test_the_index_that_pandas_wrote_is_the_times(tmp_path, kind, time):
+    index: Any = pd.date_range("2024-01-01", periods=60, freq="7min", tz="UTC")
+    if kind != "DatetimeIndex":
+        index = index - index[0] if kind == "TimedeltaIndex" else clock_periods(index)
+    frame = room().drop(columns="t").set_index(index).drop(index=index[20:27])
+    frame.to_csv(tmp_path / "a.csv")
+    expected = qm.read_log(frame, **NAMES)
+    assert (lengths(expected), expected.dt) == ([19, 32], 420)
+    log = qm.read_log(tmp_path / "a.csv", **NAMES, time=time)
+    assert same(log, expected)
+    assert (log.dt, log.dt_unit) == (420, "s")
+
+
+def clock_periods(index: pd.DatetimeIndex) -> pd.PeriodIndex:
+    return index.tz_localize(None).to_period("7min")
+
+
+def test_the_numbers_that_pandas_wrote_are_no_times(tmp_path):
+    frame = room().drop(index=range(20, 30))
+    frame.to_csv(tmp_path / "a.csv")
+    assert lengths(qm.read_log(tmp_path / "a.csv", **NAMES)) == [49]
+    assert lengths(qm.read_log(tmp_path / "a.csv", **NAMES, time="")) == [19, 29]
+
+
+def test_a_signal_has_its_header_or_its_name():
+    frame = room().rename(columns={"T": "TI-101 [degC]", "q": "q [kW]", "t": "t [min]"})
+    names: Any = {"outputs": ["TI-101 [degC]"], "inputs": "q [kW]", "known": ["T_out"]}
+    log = qm.read_log(frame, **names, time="t [min]")
+    assert (log.outputs, log.inputs, log.dt_unit) == (("TI-101",), ("q",), "min")
+    assert same(log, qm.read_log(frame, ["TI-101"], ["q"], ["T_out"], time="t"))
+    both = frame.assign(**{"TI-101 [K]": 273.15 + frame["TI-101 [degC]"]})
+    log = qm.read_log(both, ["TI-101 [K]"], ["q"])
+    assert (log.outputs, log.trajectories[0].y[0, 0].item()) == (("TI-101 [K]",), 273.15)
+    with pytest.raises(QPError, match=r"got 'TI-101', which is missing, .* TI-101 \[degC\], q"):
+        qm.read_log(both, ["TI-101"], ["q"])
+    with pytest.raises(QPError, match=r"^data: got q in kW and in W, expected one unit in all"):
+        qm.read_log([frame, room().rename(columns={"q": "q [W]", "T": "TI-101"})], **names)
+
+
 @pytest.mark.parametrize("names", [["T", "d"], ["d", "q1"], ["y", "u1"], ["known", "time"]])
 def test_a_signal_may_have_any_name(names):
     rng = np.random.default_rng(0)
@@ -204,7 +259,15 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
                 {"time": "t"},
                 f"time: got t with '{t}', expected numbers or dates",
             )
-            for t in ("noon", None, np.nan, "12:xx")
+            for t in ("noon", "12:xx")
+        ),
+        *(
+            (
+                room().assign(t=[*range(full), *[None] * (60 - full)]),
+                {"time": "t"},
+                f"time: got t, empty in {60 - full} of 60 rows, expected times in two rows or more",
+            )
+            for full in (0, 1)
         ),
         (
             room().assign(t=["2020-09-01", *["13/09/2020"] * 59]),

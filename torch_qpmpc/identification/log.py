@@ -41,8 +41,9 @@ class Log:
         trajectories: consecutive steps: outputs y, inputs u and known signals d.
         outputs, inputs, known: the names of the entries of y, u and d.
         units: units by name, where known.
-        dt: the time between steps, in the unit of the time column or in seconds; None without one.
+        dt: the time between steps, or None if no times are known.
         notes: sentences on what was split, left out or noticed.
+        dt_unit: dt's unit: s of dates and clocks, and of numbers the one in the column's header.
     """
 
     trajectories: Sequence[Trajectory]
@@ -52,6 +53,7 @@ class Log:
     units: Mapping[str, str] = field(default_factory=dict)
     dt: float | None = None
     notes: tuple[str, ...] = ()
+    dt_unit: str = ""
 
     @property
     def steps(self) -> int:
@@ -69,7 +71,7 @@ class Log:
             for kind, names in signals.items()
             if names
         )
-        every = "" if self.dt is None else f", one step every {self.dt:g}"
+        every = "" if self.dt is None else f", one step every {self.dt:g} {self.dt_unit}".rstrip()
         return "\n".join((f"{self.steps} steps{every}: {named}", *self.notes))
 
 

@@ -27,18 +27,22 @@ def read_log(
     Args:
         data: the path of a CSV file, a DataFrame, a mapping of arrays ``(T,)`` or ``(T, n)``, or a
             list of these, one for each episode; or steps as in `identify`. A unit in a header, as
-            in ``T [degC]``, is not part of the name. A shorter array lacks the last row.
-        outputs, inputs, known: the columns of y, u and, optionally, d; by default ``y``, ``u`` and
-            ``d`` or ``y1``, ``y2``, .. and so on.
-        time: the column of times: numbers, dates, periods or time differences; by default a
-            DataFrame's index of these. A clock may show one time for several rows.
+            in ``T [degC]``, is not part of the name. A shorter array lacks the last row. A file
+            with semicolons or tabs may have decimal commas.
+        outputs, inputs, known: the names or headers of the columns of y, u and, optionally, d; by
+            default ``y``, ``u`` and ``d`` or ``y1``, ``y2``, .. and so on.
+        time: the column of times: numbers, dates, periods, time differences or clocks, such as
+            ``20260301093000``, ``093000``, ``59:30.5`` or ``24:00``; by default a DataFrame's index
+            of these, also as `DataFrame.to_csv` writes it, without a header. Of several readings
+            the one with the most even steps counts. A clock may show one time for several rows; an
+            empty time is as far between its neighbours as its row.
         episode: the column of marks that differ between episodes.
         day_first: True for dates such as 29/09/2020, False for 09/29/2020; by default the reading
             with fewer gaps.
 
     Returns:
         The log. A `UserWarning` names columns that are constant, a linear function of others or
-        marked by a number such as -9999, and dates that may be read in two ways.
+        marked by a number such as -9999, times that may be read in two ways, and many gaps.
 
     Raises:
         QPError: a column is missing, named twice, without numbers or with text such as ``1,5`` or

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,13 +16,13 @@ import torch
 
 from torch_qpmpc.checks import ungraded
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds
+from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds, shows_times
 from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory
 
 #: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away.
 FAR = 10
-#: The column of a DataFrame's index of times.
-TIME_INDEX = "the index"
+#: The column of a DataFrame's index of times, and the one of an index in a file, by pandas.
+TIME_INDEX, FILE_INDEX = "the index", "Unnamed: 0"
 #: A column's header with its unit, as in ``T [degC]``.
 HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
 KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
@@ -39,38 +40,40 @@ def read_tables(
     if not frames:
         raise QPError.expected("data", "an empty list", KINDS)
     marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
+    headers, units = _name_columns(frames)
     frame = pd.concat(frames, ignore_index=True)
-    headers = [HEADER.fullmatch(str(header)) for header in frame.columns]
-    units = {match[1]: match[2] for match in headers if match}
-    frame.columns = [_bare(header) for header in frame.columns]
-    chosen = [[x] if isinstance(x, str) else x for x in signals]
+    listed = [[x] if isinstance(x, str) else x for x in signals]
+    chosen = [x and [headers.get(str(name).strip(), name) for name in x] for x in listed]
+    time, episode = (x if x is None else headers.get(str(x).strip(), x) for x in (time, episode))
     taken = {time, episode, *(name for names in chosen for name in names or ())}
     kinds = zip(chosen, "yud", ("outputs", "inputs", "known"), strict=True)
     y, u, d = (_columns(frame, *kind, taken) for kind in kinds)
     names = (*y, *u, *d)
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise QPError.expected("column", f"{twice[0]!r} twice", "each once")
-    (values, words), times = _numbers(frame, names), _times(frame, time, day_first)
+    values, words = _numbers(frame, names)
+    times, dt_unit, read = _times(frame, time, day_first)
+    dt_unit = dt_unit or units.get(str(time), "")
     if episode is not None:
         column = _column(frame, episode)
         marks = marks + (column != column.shift()).cumsum().to_numpy()
-    trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)))
+    trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)), dt_unit)
     usual = values[(np.abs(values) <= LARGEST).all(1)]
     if noticed := (*_marked(usual, names), *_dependent(usual, names)):
         warnings.warn(f"In this log, {'; '.join(noticed)}.", UserWarning, stacklevel=3)
     units = {name: x for name, x in units.items() if name in names}
-    return Log(trajectories, y, u, d, units, dt, (note, *words, *noticed))
+    return Log(trajectories, y, u, d, units, dt, (note, *read, *words, *noticed), dt_unit)
 
 
 def _split(
-    values: Any, times: np.ndarray | None, marks: Any, sizes: tuple[int, int, int]
+    values: Any, times: np.ndarray | None, marks: Any, sizes: tuple[int, int, int], unit: str
 ) -> tuple[list[Trajectory], float | None, str]:
     """Return the trajectories in rows ``values`` [y, u, d], the time of a step, and a note."""
     n_y = sizes[0]
     fits = np.abs(values) <= LARGEST  # False for NaN
     whole, measured = fits.all(1), fits[:, :n_y].all(1)
     inside = marks[1:] == marks[:-1]
-    gaps, dt = gaps_of(times, inside, marks)
+    gaps, dt = gaps_of(times, inside, marks, unit)
     steps = whole[:-1] & measured[1:] & inside & ~gaps
     edges = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
     if not len(edges):
@@ -117,18 +120,56 @@ def _frame(part: Any) -> pd.DataFrame:
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
-    """Read a CSV file by its header; an empty field beyond that is a delimiter too many."""
-    with path.open(encoding="utf-8-sig", newline="") as file, warnings.catch_warnings():
+    """Read a CSV file by its header; an empty field beyond that is a delimiter too many.
+
+    The delimiter that the header has most of, of comma, semicolon and tab, is the file's. Unless
+    it is a comma, numbers may have decimal commas.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        text = path.read_text(encoding="cp1252")
+    headers = {}
+    for sep in ",;\t":
+        rows = csv.reader(io.StringIO(text), delimiter=sep, skipinitialspace=True)
+        headers[sep] = next(filter(None, rows), [])
+    sep = max(headers, key=lambda sep: len(headers[sep]))
+    with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # that fields would be lost
-        header = next(filter(None, csv.reader(file, skipinitialspace=True)), [])
-        file.seek(0)  # no address in the internet
-        frame = pd.read_csv(file, index_col=False, skipinitialspace=True, low_memory=False)
-    return frame.set_axis(header, axis=1)  # without pandas's other names for what is there twice
+        frame = pd.read_csv(
+            io.StringIO(text),
+            sep=sep,
+            decimal="." if sep == "," else ",",
+            index_col=False,
+            skipinitialspace=True,
+            low_memory=False,
+        )
+    # Without pandas's other names for what is there twice.
+    return frame.set_axis(headers[sep], axis=1)
 
 
 def _bare(header: Any) -> str:
     """Return a header without its unit."""
     return HEADER.sub(r"\1", str(header)).strip()
+
+
+def _name_columns(frames: Sequence[pd.DataFrame]) -> tuple[dict[str, str], dict[str, str]]:
+    """Name the columns without units where that is clear; return names by header, and units."""
+    headers: dict[str, str] = {}
+    units: dict[str, str] = {}
+    for frame in frames:
+        bare, names = [_bare(x) for x in frame.columns], []
+        for i, (header, name) in enumerate(zip(map(str, frame.columns), bare, strict=True)):
+            header = header.strip()
+            name = name if bare.count(name) == 1 else header
+            names.append(name or f"Unnamed: {i}")
+            headers.setdefault(header, names[-1])
+            unit = match[2] if (match := HEADER.fullmatch(header)) else None
+            if unit is not None and units.setdefault(name, unit) != unit:
+                got = f"{name} in {units[name]} and in {unit}"
+                raise QPError.expected("data", got, "one unit in all episodes", "Convert one.")
+        frame.columns = names
+    return headers, units
 
 
 def _columns(
@@ -162,8 +203,8 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, lis
         if len(odd):
             got, want = f"{name} with {odd.iloc[0]!r} in {_count(len(odd), 'row')}", "1234.5"
             remedy = (
-                "Pass a DataFrame: pandas.read_csv(.., decimal=',') reads decimal commas, and "
-                "thousands=',' separators; units belong in the header, as in 'q [kW]'."
+                "Pass a DataFrame: pandas.read_csv(.., sep=';', decimal=',') reads decimal commas, "
+                "and thousands=',' separators; units belong in the header, as in 'q [kW]'."
             )
             raise QPError.expected("column", got, want, remedy)
         if not np.isfinite(values[:, i]).any():
@@ -184,11 +225,17 @@ def _column(frame: pd.DataFrame, name: str) -> Any:
     return frame[name]
 
 
-def _times(frame: pd.DataFrame, name: str | None, day_first: bool | None) -> np.ndarray | None:
-    """Return the times in seconds or the column's unit; None without a column of times."""
-    if name is None and TIME_INDEX not in frame.columns:
-        return None
-    column = _column(frame, name or TIME_INDEX).infer_objects()
+def _times(
+    frame: pd.DataFrame, name: str | None, day_first: bool | None
+) -> tuple[np.ndarray | None, str, list[str]]:
+    """Return the times, their unit and notes; None without a column of times."""
+    if name is None:
+        name, first = TIME_INDEX, frame.iloc[:1, 0]
+        if frame.columns[0] == FILE_INDEX and shows_times(first):
+            name = FILE_INDEX
+        if name not in frame.columns:
+            return None, "", []
+    column = _column(frame, name).infer_objects()
     if column.dtype.kind not in "mM" and not isinstance(column.dtype, pd.PeriodDtype):
         column = column.where(column.astype(str).map(_bare) != column.name)  # a header in between
     return seconds(column, day_first)
