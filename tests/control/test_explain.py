@@ -107,8 +107,16 @@ def test_faulty_steps_are_told_in_words():
     made.step([2.0, 0.3], [np.nan, 0.0], known=KNOWN)
     told = made.explain()
     assert "INVALID: A set-point, known signal or first output is invalid" in str(told)
-    assert len(told.y) == 0
+    assert (told.u == made.u).all()
+    assert np.isfinite(told.y).all(), "what the held input leads to"
     assert told.limits == ()
+    made.step([2.0, 0.3], known={"d": np.nan, "most": 2.0})
+    assert np.isfinite(made.explain().y).all()
+    made.explain().plot()
+    started = controller()
+    started.step({"T": None, "h": 0.3}, [8.0, 0.0], known=KNOWN)
+    assert np.isnan(started.explain().y).all()
+    started.explain().plot()
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import PREFIX
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.review import Setting, set_points
-from torch_qpmpc.control.simulation import Run
+from torch_qpmpc.control.simulation import Run, last_known
 from torch_qpmpc.control.state_space import Array
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 #: A multiplier this small, relative to a typical stage's cost for a usual deviation, is rounding.
 ACTIVE = 1e-6
+PLANNED = (Outcome.SOLVED, Outcome.MISSING)
 
 
 class Limit(NamedTuple):
@@ -38,7 +39,7 @@ class Explanation:
     """The last step and its plan; ``print`` shows it, and ``plot`` draws the plan.
 
     Of a ``design`` and its ``status`` it has in ``now`` measured outputs, set-points and known
-    signals; in ``u`` and ``y`` the plan's inputs ``(N, m)``, one row without one, and the outputs
+    signals; in ``u`` and ``y`` the plan's inputs ``(N, m)``, held without one, and the outputs
     after them; in ``limits`` what holds it back, dearest first; the estimated ``disturbances``; and
     in ``reach`` which set-points are in reach, and what to do if r is not.
     """
@@ -57,44 +58,44 @@ class Explanation:
         lines = [f"{self.status}: {self.status.explanation}"]
         for i, name in enumerate(plant.outputs):
             aim = f", set-point {self.now.r[0, i]:.4g}" * bool(self.design.Q[i].any())
-            later = f", in {len(self.y)} steps {self.y[-1, i]:.4g}" if len(self.y) else ""
+            later = f", in {len(self.y)} steps {self.y[-1, i]:.4g}"
+            later *= bool(np.isfinite(self.y[-1, i]))
             lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
         for i, name in enumerate(plant.inputs):
-            shown = np.unique(np.linspace(1, len(self.u) - 1, 5).astype(int))
-            later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown if len(self.u) > 1)
+            shown = np.unique(np.linspace(0, len(self.u) - 1, 6).astype(int))[1:]
+            later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
             lines.append(f"{plant.quantity(name, self.u[0, i])}{', then ' * bool(later)}{later}")
         for name, x in self.disturbances.items():
             unit = plant.units.get(name.removeprefix(PREFIX), "")
             lines.append(f"{name} {x:.4g} {unit}".rstrip())
-        free = ["No bound holds the plan back."][: len(self.y)]
+        free = ["No bound holds the plan back."] * (self.status in PLANNED)
         return "\n".join([*lines, *([x.text for x in self.limits] or free), self.reach])
 
     def plot(self) -> Figure:
         """Return a figure of the plan, with bounds and set-points."""
         y, rows = np.vstack((self.now.y, self.y)), np.arange(len(self.y) + 1)
         r, known = (x[np.minimum(rows, len(x) - 1)] for x in (self.now.r, self.now.known))
-        return Run(self.design, y, r, self.u[: len(self.y)], known[:-1], self.u, self.u[0]).plot()
+        return Run(self.design, y, r, self.u, known[:-1], self.u, self.u[0]).plot()
 
 
 def explain(law: Law, memory: Memory, status: Outcome, now: Signals, p: Tensor) -> Explanation:
     """Return what a step with the plan's input p has come to, from the memory after it."""
-    design, mpc, observer = law.design, law.mpc, law.observer
-    u, y, limits, known = memory.u[None], np.empty((0, len(design.Q))), (), now.known
-    if status in (Outcome.SOLVED, Outcome.MISSING):
-        plan = law.plans.solve(p.numpy()[None])
+    design, mpc, known = law.design, law.mpc, now.known
+    if status == Outcome.INVALID:  # the last valid signals hold
+        known = np.tile(last_known(design, memory), (len(known), 1))
+    u, e, rows = np.tile(memory.u, (design.horizon, 1)), memory.e, []
+    plan = law.plans.solve(p.numpy()[None]) if status in PLANNED else None
+    if plan is not None:
         _, moved = mpc.plan.predicted(torch.from_numpy(plan.z[0]))
-        u = memory.u + (moved - moved[0]).numpy()
-        e, rows = memory.e, []
-        assert e is not None
-        for k in range(1, len(u) + 1):
-            rows.append(observer.H @ e)
-            e = observer.predicted(e, u[min(k, len(u) - 1)], known[k])
-        y = np.array(rows)
-        limits = _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
+        u += (moved - moved[0]).numpy()
+    for k in range(len(u)):
+        rows.append(np.full(len(design.Q), np.nan) if e is None else law.observer.H @ e)
+        e = e if e is None else law.observer.predicted(e, u[min(k + 1, len(u) - 1)], known[k + 1])
+    y = np.array(rows)
+    limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]
-    valid = known[0] if np.isfinite(known[0]).all() else design.nominal
-    finding = set_points(Setting(mpc, w, valid), memory.r, False)
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
+    finding = set_points(Setting(mpc, w, known[0]), memory.r, False)
     reach = f"{finding.text} {finding.remedy}".rstrip()
     return Explanation(design, status, now, u, y, limits, names, reach)
 
