@@ -146,7 +146,8 @@ class QuadraticProgram:
 
     def __post_init__(self, check_values: bool, n_known: int) -> None:
         self._check_shapes()
-        check_whole("n_known", n_known, 0)
+        if n_known != 0:
+            check_whole("n_known", n_known, 0)
         if check_values:
             self._check_values(n_known)
 

@@ -108,12 +108,17 @@ def _checked_batch(qp: QuadraticProgram, fixed: Tensor) -> tuple[int, ...]:
     if fixed.device != qp.q.device:
         got, remedy = f"a tensor on {fixed.device}", f"Move it: fixed.to({str(qp.q.device)!r})."
         raise QPError.expected("fixed", got, f"one on the QP's {qp.q.device}", remedy)
-    got, expected = f"shape {tuple(fixed.shape)}", f"shape (*batch, n_f) with n_f <= n_z = {qp.n_z}"
-    if fixed.ndim == 0 or fixed.shape[-1] > qp.n_z:
+    n_z = qp.q.shape[-1]
+    if fixed.ndim == 0 or fixed.shape[-1] > n_z:
+        got, expected = (
+            f"shape {tuple(fixed.shape)}",
+            f"shape (*batch, n_f) with n_f <= n_z = {n_z}",
+        )
         raise QPError.expected("fixed", got, expected)
     try:
         return broadcast(qp.batch_shape, fixed.shape[:-1])
     except RuntimeError as error:
+        got = f"shape {tuple(fixed.shape)}"
         shape = tuple(qp.batch_shape)
         expected = f"leading dimensions that broadcast with the QP's batch {shape}"
         raise QPError.expected("fixed", got, expected) from error

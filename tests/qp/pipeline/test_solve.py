@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.benchmarks.stays import of_value
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
@@ -421,3 +422,10 @@ def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
     assert_close((solution.upsilon + solution.eta)[:, x_1], torch.full((2, 1), 100.0).double())
     assert solution.residual.max() < 1e-8
     assert solution.iterations.max() < 100
+
+
+def test_a_value_changes_files_seldom():
+    """`python -m tests.benchmarks.stays` counts; a reader changes page as often."""
+    journey = of_value("daqp")
+    assert journey.stays <= 50
+    assert journey.files <= 15

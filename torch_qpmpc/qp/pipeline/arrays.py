@@ -5,7 +5,7 @@ They are NumPy's, on the CPU; `torch_qpmpc.qp.pipeline.device` fills the same tu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,17 +79,19 @@ class SoftQPs(NamedTuple):
         """Return the problems at ``index``, with the same matrices."""
         return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
 
-    def in_lengths(self) -> tuple[SoftQPs, np.ndarray, np.ndarray] | None:
-        """Return the QPs in units of their own, and the units of v and lam; None if none is long.
+    def solved_by(self, solve: Callable[[SoftQPs], BackendSolution]) -> BackendSolution:
+        """Solve the QPs, unusually long ones in units of their own, powers of two.
 
         An optimum far from zero is no match for a solver's absolute tolerances. It is no further
-        than without rows, and seldom than most bounds. Units ``(B, 1)`` are powers of two.
+        than without rows, and seldom than most bounds.
         """
+        if np.abs(self.g).max(initial=0.0) <= LONG * np.abs(self.H).max((1, 2), initial=0.0).min():
+            return BackendSolution._make(map(to_numpy, solve(self)))
         with np.errstate(all="ignore"):
             curvature = np.ldexp(1.0, np.frexp(np.abs(self.H).max((1, 2), initial=0.0))[1])
             size = np.abs(self.g).max(-1, initial=0.0) / curvature[self.group]
             if not ((size > LONG) & (size < np.inf)).any():
-                return None
+                return BackendSolution._make(map(to_numpy, solve(self)))
             near = (np.where(x != 0, np.abs(x), np.inf) for x in (self.l, self.u))
             near = np.minimum(*near) / np.linalg.norm(self.G, axis=-1)[self.group]
             size = np.minimum(size, np.median(near, axis=-1)) if near.shape[1] else size
@@ -97,7 +99,9 @@ class SoftQPs(NamedTuple):
         length = np.where(long, np.ldexp(1.0, np.frexp(size)[1]), 1.0)[:, None]
         force = curvature[self.group, None] * length
         parts = {"H": self.H / curvature[:, None, None], "g": self.g / force, "w": self.w / force}
-        return self._replace(**parts, l=self.l / length, u=self.u / length), length, force
+        scaled = self._replace(**parts, l=self.l / length, u=self.u / length)
+        v, lam, iterations = map(to_numpy, solve(scaled))
+        return BackendSolution(v * length, lam * force, iterations)
 
     def in_numpy(self) -> SoftQPs:
         return SoftQPs._make(map(to_numpy, self))
@@ -121,9 +125,6 @@ class BackendSolution(NamedTuple):
         for own, new in zip(self, other, strict=True):
             own[index] = new
 
-    def in_numpy(self) -> BackendSolution:
-        return BackendSolution._make(map(to_numpy, self))
-
 
 class BatchSolution(NamedTuple):
     """Solutions of B QPs, see `QPSolution`; a candidate has status 0, and `accepted` judges it."""
@@ -143,9 +144,8 @@ class BatchSolution(NamedTuple):
         """Return the mask of solutions that the certificate accepts, ``(B,)``."""
         return (self.residual <= TOLERANCE) & (self.value_error <= TOLERANCE)
 
-    @property
-    def all_accepted(self) -> bool:
-        return bool(self.accepted().all())
+    def in_torch(self) -> BatchSolution:
+        return BatchSolution._make([torch.from_numpy(x) for x in self])
 
     def at(self, index: np.ndarray) -> BatchSolution:
         """Return copies of the solutions at ``index``."""

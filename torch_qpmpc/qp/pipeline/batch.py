@@ -196,8 +196,10 @@ class Programs:
         if not shared:
             batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(batch, *batches)
-        fixed = to_numpy(_flattened(fixed.detach(), batch, (n_f,)).double().contiguous())
-        flat, group = [to_numpy(x)[np.newaxis] for x in theta], np.zeros(len(fixed), np.int64)
+        fixed = _flattened(fixed, batch, (n_f,)).numpy(force=True)
+        fixed = np.ascontiguousarray(fixed, np.float64)
+        flat = [x.numpy(force=True)[np.newaxis] for x in theta]
+        group = np.zeros(len(fixed), np.int64)
         if not shared:
             flat, group = _flat_theta(theta, batch)
         if all(len(x) == 1 for x in flat):
@@ -285,8 +287,8 @@ class Programs:
         d, r = reduced.H.shape[-1], len(reduced.rows)
         g_l_u = sample.offsets(self.fixed, self.group, reduced.matrix, reduced.constant)
         w = reduced.w
-        if len(w) != len(self):  # the same row for each QP, without a copy
-            w = np.ndarray((len(self), r), buffer=w, strides=(0, w.itemsize))
+        if len(w) != len(self.group):  # the same row for each QP, without a copy
+            w = np.ndarray((len(self.group), r), buffer=w, strides=(0, w.itemsize))
         g, lower, upper = g_l_u[:, :d], g_l_u[:, d : d + r], g_l_u[:, d + r :]
         return SoftQPs(reduced.H, reduced.G, self.group, g, lower, upper, w)
 

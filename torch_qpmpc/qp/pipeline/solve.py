@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextvars
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,7 +24,6 @@ from torch_qpmpc.qp.pipeline.arrays import (
     BatchSolution,
     SoftQPs,
     to_numpy,
-    to_tensor,
 )
 from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
@@ -137,10 +136,10 @@ def solve_now(*arguments: Any) -> BatchSolution:
         got = f"{count:,} QPs of n_z = {q.shape[-1]}"
         remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
         raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
-    if on_failure != "mask" and not solution.all_accepted:
+    if on_failure != "mask" and solution.status.any():
         _report(solution, batch, on_failure)
 
-    outputs = BatchSolution._make(map(to_tensor, solution))
+    outputs = solution.in_torch()
     if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs.value.device:
         return outputs
 
@@ -221,8 +220,9 @@ class AtRest:
         return Programs(self.prepared, np.zeros(1, np.int64), fixed)
 
 
-#: A step maps QPs without a certified solution, and their best candidates so far, to candidates.
-Step = Callable[[Programs, BatchSolution], BatchSolution]
+#: A step maps QPs without a certified solution, and their best candidates so far, to candidates;
+#: a device and backends ignore these, which the first has not.
+Step = Callable[[Programs, Any], BatchSolution]
 
 
 def solve_programs(
@@ -236,33 +236,40 @@ def solve_programs(
     ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`; a
     ``device`` makes the first attempt.
     """
-    began, log = time.perf_counter(), _active_log.get(None) or SolveLog()
-    units = programs.prepared.units
+    began, log = time.perf_counter(), _active_log.get(unused := SolveLog())
     steps = steps_of(solver, log, start is not None, device)
-    solution = _solved(programs.scaled(), steps, start)
-    if units is not None:
-        solution = units.restored(solution, programs.group)
-    log.add(solution, time.perf_counter() - began)
+    if (units := programs.prepared.units) is None:
+        solution = _solved(programs, steps, start)
+    else:
+        solution = units.restored(_solved(programs.scaled(), steps, start), programs.group)
+    if log is not unused:
+        log.add(solution, time.perf_counter() - began)
     return solution
 
 
-def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> BatchSolution:
+def _solved(programs: Programs, steps: Iterator[Step], start: np.ndarray | None) -> BatchSolution:
     """Take the steps until each QP has a certified solution, or a proof that it has none."""
-    solution, todo = programs.unsolved(Status.INVALID_DATA), programs.solvable()
-    todo = np.arange(len(programs)) if todo is None else todo
-    solution.status[todo] = Status.NOT_CONVERGED
-    if start is not None:
-        solution.active[:] = start
+    count, solution, solvable = len(programs.group), None, programs.solvable()
+    todo = np.arange(count) if solvable is None else solvable
+    if solvable is not None or start is not None:
+        solution = programs.unsolved(Status.INVALID_DATA)
+        solution.status[todo] = Status.NOT_CONVERGED
+        solution.active[:] = solution.active if start is None else start
     for step in steps:
         if not len(todo):
             break
-        whole = len(todo) == len(programs)
-        left, best = programs if whole else programs.take(todo), solution.at(todo)
-        answer = step(left, best)
-        if whole and answer.all_accepted:
-            return answer
-        solution.improve(todo, answer)
-        todo = todo[~(solution.accepted() | solution.proved())[todo]]
+        if solution is None:  # the first step needs no candidates
+            solution = step(programs, None)
+        elif len(todo) == count:
+            solution.improve(todo, step(programs, solution))
+        else:
+            solution.improve(todo, step(programs.take(todo), solution.at(todo)))
+        solved = solution.accepted()
+        if solved.all():
+            return solution
+        todo = todo[~(solved | solution.proved())[todo]]
+    if solution is None:
+        return programs.unsolved(Status.NOT_CONVERGED)
     solution.status[todo] = Status.NOT_CONVERGED
     unsolved = np.flatnonzero(~solution.accepted())
     solution.clear(unsolved, programs.unsolved(solution.status))
@@ -271,41 +278,41 @@ def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> 
 
 def steps_of(
     solver: str, log: SolveLog, warm: bool = False, device: torch.device | None = None
-) -> list[Step]:
-    """Return the steps of a solve, each for the QPs that the ones before leave.
+) -> Iterator[Step]:
+    """Yield the steps of a solve, each for the QPs that the ones before leave.
 
     Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
     them after other eliminations, which solve whole batches.
     """
-    *others, last = map(backed, fallbacks(solver))
+    if device:
+        yield partial(_tried, device)
+    if warm:
+        yield partial(_recalled, log)
+    yield backed(backend(solver))
     refined = partial(_refined, log)
-    return [
-        *([partial(_tried, device)] if device else []),
-        *([partial(_recalled, log)] if warm else []),
-        backed(backend(solver)),
-        partial(_if_few, refined),
-        partial(_counted, log),
-        partial(_if_few, _diagnosed),
-        *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
-        refined,
-        _diagnosed,
-        *others,
-        partial(_refined_last, log, last),
-    ]
+    yield partial(_if_few, refined)
+    yield partial(_counted, log)
+    yield partial(_if_few, _diagnosed)
+    yield from (partial(_eliminated, way) for way in OTHER_ELIMINATIONS)
+    yield refined
+    yield _diagnosed
+    *others, last = map(backed, fallbacks(solver))
+    yield from others
+    yield partial(_refined_last, log, last)
 
 
 def backed(solve: Backend, passes: int = 0) -> Step:
     """Return the step of a backend, see `Programs.recover`."""
 
-    def step(programs: Programs, _: BatchSolution) -> BatchSolution:
+    def step(programs: Programs, _: Any) -> BatchSolution:
         qps = programs.reduced_qps()
-        answer = _in_lengths(solve if qps.l.shape[-1] else _unconstrained, qps)
+        answer = qps.solved_by(solve if qps.l.shape[-1] else _unconstrained)
         return programs.recover(answer, passes)
 
     return step
 
 
-def _tried(device: torch.device, programs: Programs, _: BatchSolution) -> BatchSolution:
+def _tried(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
     return attempt(programs, device)
 
 
@@ -354,15 +361,6 @@ def _eliminated(eliminate: Eliminate, programs: Programs, best: BatchSolution) -
     if not C.size or (elimination := eliminate(C, programs.n_f)) is None:
         return best
     return backed(BACKENDS["torch"], PASSES)(programs.eliminated(elimination), best)
-
-
-def _in_lengths(solve: Backend, qps: SoftQPs) -> BackendSolution:
-    """Solve QPs, in lengths of their own where these are unusual."""
-    if (own := qps.in_lengths()) is None:
-        return solve(qps).in_numpy()
-    qps, length, force = own
-    v, lam, iterations = solve(qps).in_numpy()
-    return BackendSolution(v * length, lam * force, iterations)
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
