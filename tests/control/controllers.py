@@ -56,19 +56,21 @@ def load(
 
 
 def exported(
-    make: Callable[..., qm.Controller], **options
+    make: Callable[..., qm.Controller], missing: bool = False, **options
 ) -> tuple[qm.Controller, CompiledController]:
     """Return a new controller, and its functions in C, which are exported once for each design."""
-    twin = _exported(make, (*sorted(options.items()),))
+    twin = _exported(make, missing, (*sorted(options.items()),))
     twin.reset()
     return make(**options), twin
 
 
 @functools.cache
-def _exported(make: Callable[..., qm.Controller], options: tuple) -> CompiledController:
+def _exported(
+    make: Callable[..., qm.Controller], missing: bool, options: tuple
+) -> CompiledController:
     controller = make(**dict(options))
     with tempfile.TemporaryDirectory() as folder:
-        return load(controller.export_c(folder).files, controller)
+        return load(controller.export_c(folder, missing=missing).files, controller)
 
 
 class Plant(NamedTuple):

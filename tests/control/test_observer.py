@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import scipy.linalg
 
 import torch_qpmpc as qm
 from tests.control.controllers import exported
@@ -94,17 +96,60 @@ def test_a_disturbance_drifts_within_the_horizon_by_the_noise_of_the_outputs():
     assert np.allclose(law.drift, 0.1 * 0.2), "at most a tenth of the input's range"
 
 
-def test_c_starts_from_the_same_states_and_settles_alike():
-    controller, twin = exported(filtered)
+@pytest.mark.parametrize("missing", [False, True])
+def test_c_starts_from_the_same_states_and_settles_alike(missing):
+    controller, twin = exported(filtered, missing)
     rng = np.random.default_rng(1)
     for y, u in ((None, None), ([0.3], [0.5])):
         controller.reset(y, u)
         twin.reset(y, u, None)
         for k in range(2 * len(controller.observer.gains)):
-            y = [rng.normal(1.0, 0.5) if k != 3 else np.nan]
+            lost = missing and k in (2, 3, 6, 7, 8)
+            y = [np.nan if lost else rng.normal(1.0, 0.5)]
             input_, code = twin.step(y, [[0.5]])
             assert np.allclose(controller.step(y, [0.5]), input_, atol=1e-9)
-            assert controller.status == code == (4 if k == 3 else 0)
+            assert controller.status == code == (4 if lost else 0)
+
+
+MASS = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
+TWO = np.array([[1.0, 0.0], [0.0, 0.3]])
+
+
+def two_sensors() -> qm.Controller:
+    """Return the controller of a mass with a slow position sensor and a noisy speed."""
+    options = {"Q": {"y1": 1.0}, "dR": 0.1, "u_bounds": (-5.0, 5.0)}
+    mpc = qm.LinearMPC((*MASS, TWO), 10, **options)
+    return qm.Controller(mpc, noise=[0.01, 0.05])
+
+
+def test_gains_of_missing_outputs_are_those_of_the_textbook_filter_in_python_and_in_c():
+    """Position every seventh step, speed with losses; both also from a reset, and in full."""
+    controller, twin = exported(two_sensors, True)
+    o, rng = controller.observer, np.random.default_rng(3)
+    controller.reset(y=[0.0, 0.0], u=[0.0])
+    twin.reset([0.0, 0.0], [0.0], None)
+    n_e = len(o.F)
+    # The steady state's own covariance, by Riccati's equation with the noise of `kalman`.
+    B, drift, noise = o.G, controller._law.drift, controller._law.noise
+    W = (0.01 * 5) ** 2 * B @ B.T + np.diag([0.0, 0.0, *drift**2])
+    V = np.diag(noise**2)
+    P = scipy.linalg.solve_discrete_are(o.F.T, o.H.T, W, V)
+    np.testing.assert_allclose(P @ o.H.T @ np.linalg.inv(o.H @ P @ o.H.T + V), o.L, atol=1e-9)
+    e = np.concatenate((controller.x, controller.w))
+    for k in range(120):
+        seen = np.array([k % 7 == 0 or k > 60, rng.random() < 0.4 or k > 60])
+        y = np.where(seen, rng.normal(0.0, 0.05, 2), np.nan)
+        H = o.H[seen]
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + V[np.ix_(seen, seen)])
+        e, P = e + K @ (y[seen] - H @ e), P - K @ H @ P
+        input_, code = twin.step(y, [[0.2, 0.0]])
+        u = controller.step(y, [0.2, 0.0])
+        e, P = o.predicted(e, u, np.zeros(0)), o.F @ P @ o.F.T + W
+        np.testing.assert_allclose(np.concatenate((controller.x, controller.w)), e, atol=1e-9)
+        np.testing.assert_allclose(input_, u, atol=1e-8)
+        assert controller.status == code == (0 if seen.all() else 4)
+    assert controller._memory.P is None, "steady again"
+    assert len(e) == n_e
 
 
 def test_a_saved_controller_settles_as_if_it_had_not_been_saved(tmp_path):

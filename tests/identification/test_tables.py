@@ -186,7 +186,7 @@ def test_a_signal_may_have_any_name(names):
 # Gaps, marks and missing numbers
 
 
-def test_gaps_marks_and_missing_numbers_end_trajectories():
+def test_gaps_marks_and_missing_inputs_end_trajectories_and_missing_outputs_stay():
     frame = room()
     frame.loc[10:, "t"] += 5.0  # between rows 9 and 10
     frame.loc[20, "T"] = np.nan
@@ -196,11 +196,14 @@ def test_gaps_marks_and_missing_numbers_end_trajectories():
     frame["T"] = frame["T"].astype(object)
     frame.loc[59, "T"] = "n/a"
     log = qm.read_log(frame, **NAMES, time="t", episode="run")
-    assert lengths(log) == [9, 9, 18, 10, 6]
-    assert log.notes[0] == "60 rows: 1 gap, 5 trajectories, 5.0% of rows dropped"
+    assert lengths(log) == [9, 29, 10, 6]
+    note = "60 rows: 1 gap, 4 trajectories, 3.3% of rows dropped, 1.7% of outputs missing"
+    assert log.notes[0] == note
+    assert log.trajectories[1].y.isnan().flatten().nonzero().flatten().tolist() == [10]
     assert log.notes[1:] == ("T is no number in 1 row, as in 'n/a'",)
     assert_close(
-        log.trajectories[1].y[:, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
+        log.trajectories[1].y[:10, 0],
+        torch.as_tensor(np.array(frame["T"][10:20], dtype=float)),
     )
 
 
@@ -293,7 +296,11 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
             {"time": "t"},
             "time: got steps of 0.5 from row 60 on, and of 0.25 in the median, expected one samp",
         ),
-        (room(1), {}, "data: got 1 rows, of which no two in a row are complete, expected consec"),
+        (
+            room(1),
+            {},
+            "data: got 1 rows, of which no two have outputs and all inputs between them, exp",
+        ),
         ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),
         ({"T": np.ones(9), "q": np.ones(7)}, {}, "q: got 7 rows, expected 9 rows, as others, or 8"),
         (

@@ -76,7 +76,7 @@ def test_an_identified_plant_has_the_moments_of_its_model(found):
     rng, zero = torch.Generator().manual_seed(0), torch.zeros(4000, 1).double()
     s = plant.starts(rng, 4000)
     first = model.C @ model.P0 @ model.C.T + model.S
-    L = model.gain(model.P0)[0]
+    L = model.course(np.ones((1, 1), bool)).K[0]
     spread = torch.as_tensor(L @ first @ L.T)
     torch.testing.assert_close(
         plant.known(s).T.cov(), spread, rtol=0.2, atol=0.05 * spread.max().item()

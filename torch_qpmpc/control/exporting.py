@@ -16,6 +16,7 @@ import numpy as np
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
+from torch_qpmpc.control.observer import STEADY
 from torch_qpmpc.control.simulation import at_rest, centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
@@ -47,6 +48,7 @@ class ControllerExport:
         state_bytes: the size of the state, None without a compiler.
         steps: the number of steps of the closed loop that is compared.
         difference: the largest difference of an input; None without a compiler.
+        missing: the covariance of the estimates is carried where outputs are missing.
     """
 
     files: tuple[Path, ...]
@@ -57,6 +59,7 @@ class ControllerExport:
     state_bytes: int | None
     steps: int
     difference: float | None
+    missing: bool = False
 
     def __str__(self) -> str:
         """Return a report of a few lines."""
@@ -67,7 +70,10 @@ class ControllerExport:
             else f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
         )
         sizes = f"tables {self.table_bytes:,} bytes{state}"
-        return "\n".join([", ".join(map(str, self.files)), sizes, compared])
+        lines = [", ".join(map(str, self.files)), sizes, compared]
+        if self.missing:
+            lines += ["steps with or after missing outputs carry the covariance of the estimates"]
+        return "\n".join(lines)
 
 
 class Loop(NamedTuple):
@@ -141,6 +147,7 @@ def export_controller(
     dtype: str = "float64",
     max_iterations: int | None = None,
     storage: str = "fast",
+    missing: bool = False,
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
     check_name(name)
@@ -161,7 +168,7 @@ def export_controller(
     course = _course(law, known)
     start = course["u"]
     loop = _run(law, course, law.policy(law.begun(start)), COMPARED)
-    texts |= _sources(law, name, dtype, loop)
+    texts |= _sources(law, name, dtype, loop, missing)
     state_bytes = difference = None
     if compiler() is not None:
         library = CompiledController(texts, name, dtype, len(start))
@@ -179,7 +186,7 @@ def export_controller(
     for file, text in texts.items():
         (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
         (folder / file).write_text(text, encoding="utf-8")
-    own = sum(x.size for x in _tables(law, dtype).values()) * np.dtype(dtype).itemsize
+    own = sum(x.size for x in _tables(law, dtype, missing).values()) * np.dtype(dtype).itemsize
     return ControllerExport(
         tuple(folder / file for file in texts),
         plan,
@@ -189,6 +196,7 @@ def export_controller(
         state_bytes,
         len(loop.u),
         None if difference is None else float(difference.max()),
+        missing,
     )
 
 
@@ -306,12 +314,13 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
     return loop
 
 
-def _sources(law: Law, name: str, dtype: str, loop: Loop) -> dict[str, str]:
+def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict[str, str]:
     """Return the texts of ``name.h`` and ``name.c``."""
     design = law.design
     sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(law).items()}
+    sizes[f"{name.upper()}_CARRIES"] = int(missing)
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
-    tables = [array(key, x, dtype) for key, x in _tables(law, dtype).items()]
+    tables = [array(key, x, dtype) for key, x in _tables(law, dtype, missing).items()]
     indices = {
         f"OF_{key}": places for key, places in zip("YU", design.bounded_places, strict=True)
     } | dict(zip(("LOWER_OF", "UPPER_OF"), design.limited[1], strict=True))
@@ -374,12 +383,16 @@ def _sizes(law: Law) -> dict[str, int]:
     }
 
 
-def _tables(law: Law, dtype: str) -> dict[str, Array]:
-    """Return the constant arrays by their names in C."""
+def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
+    """Return the constant arrays by their names in C; ``missing`` outputs take more of them."""
     design, steady, observer = law.design, law.design.steady, law.observer
-    gains = observer.gains.reshape(len(observer.gains), -1)
+    own = observer._asdict() | {"gains": observer.gains.reshape(len(observer.gains), -1)}
+    S, first, LS = own.pop("S"), own.pop("P"), observer.L @ observer.S
+    if missing:
+        own |= {"S": S, "FIRST": first, "LS": LS, "LSL": LS @ observer.L.T}
+        own |= {"OF_S": np.sqrt(np.diag(S)), "STEADY": np.array([STEADY])}
     return {
-        **{key.upper(): x for key, x in (observer._asdict() | {"gains": gains}).items()},
+        **{key.upper(): x for key, x in own.items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
         "ACTS": design.acts,

@@ -39,6 +39,7 @@ class Memory(NamedTuple):
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         rest: the outputs and the input at rest that the last reset was passed, or None for each.
+        P: the observer's P for the next step after a missing output, None while it is steady.
     """
 
     u: Array
@@ -47,6 +48,7 @@ class Memory(NamedTuple):
     known: Array | None = None
     rest: tuple[Array | None, Array | None] = (None, None)
     steps: int = 0
+    P: Array | None = None
 
 
 class Signals(NamedTuple):
@@ -250,9 +252,9 @@ class Law:
     def _seen(self, memory: Memory, y: Array, known: Array) -> tuple[Memory, Array | None, Outcome]:
         """Return the memory with the known signals, the estimate corrected by y, and the status.
 
-        The innovation of a missing output is zero, as if it were the predicted one: the gains of
-        the others are right for a steady state, and need no second factorisation in C. Rows of
-        known signals with an implausible entry are not taken; the last ones hold.
+        While an output is missing, the covariance of the estimates grows, and the gains with it,
+        until they are steady again. Rows of known signals with an implausible entry are not taken;
+        the last ones hold.
         """
         seen, valid = self._are_plausible(y, 0), self._are_plausible(known, 1).all()
         memory = memory._replace(known=known[0]) if valid else memory
@@ -263,8 +265,11 @@ class Law:
         k = min(memory.steps, last)  # another model, or a file of another machine, had more
         if e is None:
             e = observer.start if k < last else observer.at_rest(memory.u, known[0], y)
-        e = e + observer.gains[k] @ np.where(seen, y - observer.H @ e, 0.0)
-        memory = memory._replace(steps=min(k + 1, last))
+        gain, P = observer.gains[k], memory.P
+        if P is not None or not seen.all():
+            gain, P = observer.corrected(observer.spread(k) if P is None else P, seen)
+        e = e + gain @ np.where(seen, y - observer.H @ e, 0.0)
+        memory = memory._replace(steps=last if P is not None else min(k + 1, last), P=P)
         status = Outcome.SOLVED if seen.all() else Outcome.MISSING
         return memory, e, status if valid else Outcome.INVALID
 

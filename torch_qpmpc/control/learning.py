@@ -318,7 +318,7 @@ class ControlledPlant(SimulatedPlant):
     ) -> None:
         y, u, d = (x[0].nan_to_num().numpy() for x in log.trajectories[0])
         own = law.observer  # whose gain is the steady one, as its estimates in the log are
-        ends = own.L, np.eye(len(own.H)), own.at_rest(u, d, y), np.zeros_like(own.F)
+        ends = own.L, own.S, own.at_rest(u, d, y), np.zeros_like(own.F)
         observer = Innovations(own.F, own.G, own.E, own.offset, own.H, *ends)
         super().__init__(models, observer, log.trajectories, self.cost, law.design.horizon)
         self._mpc, self._design, self._from_log = law.mpc, law.design, True

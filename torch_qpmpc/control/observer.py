@@ -26,6 +26,8 @@ REST = 1e-12
 SETTLED = 1e-2
 #: .. and so is each after so many.
 MOST_GAINS = 100
+#: Where outputs were missing, the gain is the steady one again within this part of it.
+STEADY = 1e-9
 #: Signals above this multiple of a usual size are errors: estimates would lose their digits.
 ABSURD = 1e8
 
@@ -33,9 +35,14 @@ ABSURD = 1e8
 class Observer(NamedTuple):
     """e = [x; w] is predicted by ``F e + G u + E d + offset``, and corrected by ``L_k (y - H e)``.
 
+    P is the covariance of e given the outputs that there were, around the e that knows all of them:
+    zero once all were seen for long.
+
     Attributes:
         F, G, E, offset: the model of e.
         H: the outputs of e.
+        S: the covariance of y - H e in the steady state, ``(n_y, n_y)``.
+        P: the first P, zero without a log, ``(n_e, n_e)``.
         gains: L_0, .., L_T, ``(T + 1, n_e, n_y)``; the last one is the steady one, and the only one
             without a log.
         start: the mean of e in the log, where a controller starts.
@@ -48,6 +55,8 @@ class Observer(NamedTuple):
     E: Array
     offset: Array
     H: Array
+    S: Array
+    P: Array
     gains: Array
     start: Array
     rest: Array
@@ -60,6 +69,26 @@ class Observer(NamedTuple):
     def predicted(self, e: Array, u: Array, d: Array) -> Array:
         """Return the e after e with the input u and the known signals d."""
         return self.F @ e + self.G @ u + self.E @ d + self.offset
+
+    @property
+    def model(self) -> Innovations:
+        """The model of e in innovations form, without inputs."""
+        none, mean = np.zeros((len(self.F), 0)), self.start
+        return Innovations(self.F, none, none, mean, self.H, self.L, self.S, mean, self.P)
+
+    def spread(self, k: int) -> Array:
+        """Return P after k steps with all outputs."""
+        if k == len(self.gains) - 1:
+            return np.zeros_like(self.F)
+        return self.model.course(np.ones((k, len(self.H)), bool)).after
+
+    def corrected(self, P: Array, seen: Array) -> tuple[Array, Array | None]:
+        """Return the gain for the outputs that are ``seen`` and the next P, None once steady."""
+        run = self.model.course(seen[None], P)
+        size = np.sqrt(np.diag(self.S))
+        off, gain = np.abs(run.K[0] - self.L) * size, np.abs(self.L) * size
+        steady = seen.all() and (off.max(1) <= STEADY * gain.max(1)).all()
+        return run.K[0], None if steady else run.after
 
     def at_rest(self, u: Array, d: Array, y: Array) -> Array:
         """Return the e that rests with u, d and y."""
@@ -111,11 +140,12 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         got = "a model whose Kalman filter does not converge"
         remedy = "It has a mode on the unit circle that no input moves: remove it."
         raise QPError.expected("model", got, "a model with a steady-state filter", remedy)
-    start, gains = np.zeros(n + n_w), L[None]
+    start, gains, S = np.zeros(n + n_w), L[None], H @ P @ H.T + V
+    first = np.zeros_like(P)
     if plant.visited is not None:
         start[:n] = plant.visited[0]
         loads = np.diag((moving(design, SMALL * design.usual) / of_w) ** 2)
-        none, S = np.zeros((n + n_w, 0)), H @ P @ H.T + V
+        none = np.zeros((n + n_w, 0))
         first = np.asarray(block_diag(plant.visited[1], loads)) - P
         filtered = Innovations(F, none, none, start, H, L, S, start, first)
         gains = np.concatenate((filtered.gains(MOST_GAINS, SETTLED), gains))
@@ -127,6 +157,8 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         np.pad(model.E, below),
         np.pad(model.offset, (0, n_w)),
         np.hstack((model.C, own.C)),
+        of_y[:, None] * S * of_y,
+        of_e[:, None] * first * of_e,
         of_e[:, None] * gains / of_y,
         of_e * start,
         of_e[:, None] * rest / np.concatenate((of_e, of_y)),

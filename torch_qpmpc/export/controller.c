@@ -65,6 +65,86 @@ static void predict(policy_state *s, const real u[])
     copy(s->e, next, N_E);
 }
 
+#if POLICY_CARRIES
+/* Set the gain for the outputs that are seen, and the covariance to the next step's; the outputs
+   seen have V = H P H' + S as covariance of their errors, which is factored as V D V'. */
+static void advance(policy_state *s, const int seen[], real K[N_E][N_Y])
+{
+    real G[N_E][N_Y], V[N_Y][N_Y], X[N_E][N_E];
+    int at[N_Y], m = 0, i, j, k, a, b;
+    for (i = 0; i < N_Y; i++)
+        if (seen[i]) at[m++] = i;
+    for (i = 0; i < N_E; i++) {
+        for (j = 0; j < N_Y; j++) K[i][j] = 0;
+        for (a = 0; a < m; a++) {
+            G[i][a] = LS[i][at[a]];
+            for (j = 0; j < N_E; j++) G[i][a] += s->P[i][j] * H[at[a]][j];
+        }
+    }
+    for (a = 0; a < m; a++)
+        for (b = 0; b <= a; b++) {
+            V[a][b] = S[at[a]][at[b]];
+            for (j = 0; j < N_E; j++) V[a][b] += H[at[a]][j] * (G[j][b] - LS[j][at[b]]);
+            for (k = 0; k < b; k++) V[a][b] -= V[a][k] * V[b][k] * V[k][k];
+            if (b < a) V[a][b] /= V[b][b];
+        }
+    for (i = 0; i < N_E; i++) {
+        for (a = 0; a < m; a++) {
+            real x = G[i][a];
+            for (k = 0; k < a; k++) x -= V[a][k] * K[i][at[k]];
+            K[i][at[a]] = x;
+        }
+        for (a = m - 1; a >= 0; a--) {
+            K[i][at[a]] /= V[a][a];
+            for (k = a + 1; k < m; k++) K[i][at[a]] -= V[k][a] * K[i][at[k]];
+        }
+    }
+    for (i = 0; i < N_E; i++)
+        for (j = 0; j < N_E; j++) {
+            real x = s->P[i][j] + LSL[i][j];
+            for (a = 0; a < m; a++) x -= (G[i][a] * K[j][at[a]] + G[j][a] * K[i][at[a]]) / 2;
+            X[i][j] = x;
+        }
+    for (i = 0; i < N_E; i++) {
+        real row[N_E] = {0};
+        for (k = 0; k < N_E; k++)
+            for (j = 0; j < N_E; j++) row[j] += F[i][k] * X[k][j];
+        for (j = 0; j <= i; j++) {
+            s->P[i][j] = 0;
+            for (k = 0; k < N_E; k++) s->P[i][j] += row[k] * F[j][k];
+        }
+    }
+    for (i = 0; i < N_E; i++)
+        for (j = i + 1; j < N_E; j++) s->P[i][j] = s->P[j][i];
+}
+
+/* Correct the estimates by the outputs that are seen, whose covariance is carried. */
+static void correct(policy_state *s, const int seen[], int all, const real error[])
+{
+    real K[N_E][N_Y];
+    int i, j, k, whole[N_Y];
+    if (!s->carried) {
+        for (i = 0; i < N_E; i++)
+            for (j = 0; j < N_E; j++) s->P[i][j] = s->steps < LAST ? FIRST[i][j] : 0;
+        for (i = 0; i < N_Y; i++) whole[i] = 1;
+        for (k = 0; k < s->steps && s->steps < LAST; k++) advance(s, whole, K);
+        s->steps = LAST;
+    }
+    advance(s, seen, K);
+    add(s->e, &K[0][0], N_E, N_Y, error);
+    s->carried = !all;
+    for (i = 0; i < N_E; i++) {
+        real off = 0, size = 0;
+        for (j = 0; j < N_Y; j++) {
+            real gain = GAINS[LAST][i * N_Y + j], by = K[i][j] - gain;
+            off = by * OF_S[j] > off ? by * OF_S[j] : -by * OF_S[j] > off ? -by * OF_S[j] : off;
+            size = gain * OF_S[j] > size ? gain * OF_S[j] : -gain * OF_S[j] > size ? -gain * OF_S[j] : size;
+        }
+        if (!(off <= STEADY[0] * size)) s->carried = 1;
+    }
+}
+#endif
+
 /* Set the estimates to where the plant rests with outputs y and the last input. */
 static void rest(policy_state *s, const real y[])
 {
@@ -83,6 +163,7 @@ static void rest(policy_state *s, const real y[])
 static int see(policy_state *s, const real y[], const real known[], int stages)
 {
     real error[N_Y];
+    int seen[N_Y];
     int i, j, missing = 0, valid = are_sane(known, MOST_KNOWN, stages, N_D);
     if (valid) {
         copy(s->known, known, N_D);
@@ -96,13 +177,18 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
     }
     for (i = 0; i < N_Y; i++) {
         error[i] = 0;
-        if (!y || !is_sane(y[i], MOST_Y[i])) {
+        seen[i] = y && is_sane(y[i], MOST_Y[i]);
+        if (!seen[i]) {
             missing = 1;
             continue;
         }
         error[i] = y[i];
         for (j = 0; j < N_E; j++) error[i] -= H[i][j] * s->e[j];
     }
+#if POLICY_CARRIES
+    if (missing || s->carried) correct(s, seen, !missing, error);
+    else
+#endif
     add(s->e, GAINS[s->steps], N_E, N_Y, error);
     if (s->steps < LAST) s->steps++;
     return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
@@ -180,6 +266,9 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
     policy_target_reset(&s->target);
 #if POLICY_N_F
     policy_free_reset(&s->free);
+#endif
+#if POLICY_CARRIES
+    s->carried = 0;
 #endif
     for (i = 0; i < N_E; i++) s->e[i] = 0;
     for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;

@@ -38,6 +38,10 @@ typedef struct {
 #if POLICY_N_F
     policy_free_state free;
 #endif
+#if POLICY_CARRIES
+    policy_real P[POLICY_N_E][POLICY_N_E];       /* the covariance of e that is left after a missing output */
+    int carried;                                 /* 1 while it is not the steady state's */
+#endif
     int steps;                                   /* the place of the next gain; negative before a start */
 } policy_state;
 
@@ -55,7 +59,9 @@ void policy_reset(policy_state *state, const policy_real y[], const policy_real 
 
 /* Write the input u for measured outputs y; return one of the codes above.
 
-   A missing output, all of them if y is null, leaves the estimates as predicted. r has
+   A missing output, all of them if y is null, leaves the estimates as predicted. If POLICY_CARRIES,
+   the gains of the outputs that follow know that it was missing; else they are steady, which is
+   right for a few missing outputs, and not for sensors that answer in some steps only. r has
    POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last ones;
    they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and later
    steps. With the codes 0 and 4, u keeps the bounds of inputs and of their moves to rounding; with

@@ -20,6 +20,8 @@ from torch_qpmpc.identification.log import Log
 from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.identification.subspace import (
     Fit,
+    continued,
+    equal_candidates,
     explained_by_inputs,
     fit_state_space,
     held_out_errors,
@@ -40,7 +42,7 @@ class Identified:
     """A linear state-space model in innovations form, and its prediction errors.
 
     ``print`` shows the cross-validated errors: each belongs to a fit of the same order that has not
-    seen its part of the data. They are NaN for steps that no part is long enough for.
+    seen its part of the data. They are NaN where the filter settles, and after an end.
 
     Attributes:
         model: the model, whose first states are the filtered outputs.
@@ -66,7 +68,7 @@ class Identified:
     def errors(self) -> Tensor:
         """y_{k+1}, .. minus their predictions at k, ``(steps, N, n_y)``; NaN after an end.
 
-        The first steps of each trajectory, in which the filter settles, are left out.
+        They are NaN in the first steps of each trajectory, too, in which the filter settles.
         """
         order, lags = self.fit.order, self.fit.lags
         errors = held_out_errors(self.log.trajectories, order, lags, self.horizon)
@@ -80,8 +82,8 @@ class Identified:
     @property
     def R2(self) -> Tensor:
         """The share of each output's variance that is predicted 1, .., N steps ahead."""
-        outputs = torch.cat([log.y for log in self.log.trajectories])
-        return 1 - (self.rmse / outputs.std(0, correction=0)).square()
+        outputs = torch.cat([log.y for log in self.log.trajectories]).numpy()
+        return 1 - (self.rmse / torch.as_tensor(np.nanstd(outputs, 0))).square()
 
     def simulate(self, u: Any, y: Any, d: Any = None) -> Tensor:
         """Return the outputs of the model alone, without corrections by measurements.
@@ -116,9 +118,13 @@ class Identified:
         log, N = self.log, self.horizon
         poles = ", ".join(f"{abs(pole):.3g}" for pole in self.model.poles)
         white = ", ".join(f"{share:.0%}" for share in whiteness(self.model, log.trajectories))
+        orders = [row.order for row in equal_candidates(self.fit.candidates)]
+        equal = ""
+        if len({*orders}) > 1:
+            equal = f"; orders {min(orders)} to {max(orders)} are as good within their error"
         lines = [
             str(log),
-            f"Model of order {len(self.model.A)} with poles of sizes {poles}",
+            f"Model of order {len(self.model.A)} with poles of sizes {poles}{equal}",
             f"Autocorrelations of the residuals in their 95 % bound: {white}",
         ]
         shares = explained_by_inputs(self.model, log.trajectories)
@@ -222,7 +228,10 @@ def check_excitation(log: Log) -> None:
     u = torch.cat([log.u for log in trajectories])
     if n_u > 1 and ((u == 0) | (u == 1)).all() and (u.sum(-1) == 1).all():
         raise QPError.expected("action", "one-hot vectors of discrete ones", "continuous actions")
-    X = torch.cat([torch.cat((log.d, log.y[:-1], log.u), -1) for log in trajectories])
+    held = [torch.as_tensor(continued(log.y.numpy())) for log in trajectories]
+    X = torch.cat(
+        [torch.cat((x.d, y[:-1], x.u), -1) for x, y in zip(trajectories, held, strict=True)]
+    )
     middle = X.mean(0)
     X = X - middle
     size = X.square().mean(0).sqrt()

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from torch_qpmpc.identification.filter import Array, Course, alike, applied, course, filtered
+
 #: A gain that differs from the steady one by less than this share has settled.
 SETTLED = 1e-9
-#: Directions of a covariance below this share of its size, in unit variances, have none.
-SINGULAR = 1e-12
 
 
 class Innovations(NamedTuple):
@@ -55,49 +52,50 @@ class Innovations(NamedTuple):
         poles = np.linalg.eigvals(self.A)
         return poles[np.argsort(-np.abs(poles), kind="stable")]
 
-    def gain(self, P: Array) -> tuple[Array, Array, Array]:
-        """Return L_k, the covariance of e_k and P_{k+1} from P_k ``(n, n)``."""
-        C, L, S = self.C, self.L, self.S
-        V = C @ P @ C.T + S
-        inverse = _inverse(V)
-        # In directions without variance the steady gain holds.
-        gain = (P @ C.T + L @ S) @ inverse + L @ (np.eye(len(C)) - V @ inverse)
-        P = self.A @ (P + L @ S @ L.T - gain @ V @ gain.T) @ self.A.T
-        return gain, V, (P + P.T) / 2
+    def course(self, seen: Array, P: Array | None = None) -> Course:
+        """Return the filter's matrices for the outputs that are ``seen``, ``(T, n_y)``.
 
-    def settling(self, steps: int, settled: float = SETTLED) -> Iterator[tuple[Array, Array]]:
-        """Yield the gains L_0, L_1, .. from P0 and their outputs' covariances, at most ``steps``.
+        P is the first covariance, by default P0. In directions without variance the steady gain
+        holds.
+        """
+        A, C, L, S = self.A, self.C, self.L, self.S
+        none, N = np.zeros_like(A), L @ S
+        P = self.P0 if P is None else P
+        parts = (A, C, N @ L.T, N, none, S, L, P)
+        return Course(*course(*map(np.ascontiguousarray, (*parts, seen)), 0.0))
+
+    def settling(self, steps: int, settled: float = SETTLED) -> tuple[Array, Array]:
+        """Return the gains L_0, L_1, .. from P0 and their outputs' covariances, at most ``steps``.
 
         They end before the first gain that is equal to L within the part ``settled`` of it.
         """
-        P, size = self.P0, np.sqrt(np.maximum(np.diag(self.S), 0))
-        for _ in range(steps):
-            gain, V, P = self.gain(P)
-            if np.abs((gain - self.L) * size).max() <= settled * np.abs(self.L * size).max():
-                return
-            yield gain, V
+        run, size = self.course(np.ones((steps, len(self.C)), bool)), np.sqrt(np.diag(self.S))
+        off = np.abs((run.K - self.L) * size).max((1, 2))
+        same = np.append(off <= settled * np.abs(self.L * size).max(), True)
+        return run.K[: same.argmax()], run.V[: same.argmax()]
 
     def gains(self, steps: int, settled: float = SETTLED) -> Array:
         """Return the gains of `settling` ``(steps', n, n_y)``."""
-        gains = [gain for gain, _ in self.settling(steps, settled)]
-        return np.array(gains).reshape(-1, *self.L.shape)
+        return self.settling(steps, settled)[0]
 
     def estimates(self, y: Array, u: Array, d: Array) -> Array:
         r"""Return \xi_0, .., \xi_T ``(*batch, T + 1, n)`` of trajectories of equal length.
 
         Args:
-            y: outputs ``(*batch, T + 1, n_y)``.
+            y: outputs ``(*batch, T + 1, n_y)``, NaN where they are missing.
             u: inputs ``(*batch, T, n_u)``.
             d: known signals ``(*batch, T, n_d)``.
         """
-        inputs, gains = self.inputs(u, d), self.gains(y.shape[-2])
-        xi, x = np.empty((*y.shape[:-1], len(self.A))), self.x0
-        for k in range(y.shape[-2]):
-            e = y[..., k, :] - x @ self.C.T
-            xi[..., k, :] = x + e @ (gains[k] if k < len(gains) else self.L).T
-            if k < inputs.shape[-2]:
-                x = xi[..., k, :] @ self.A.T + inputs[..., k, :]
-        return xi
+        n, batch = len(self.A), y.shape[:-2]
+        y = y.reshape(-1, *y.shape[-2:])
+        inputs = self.inputs(u, d).reshape(len(y), y.shape[1] - 1, n)
+        seen, xi = ~np.isnan(y), np.empty((*y.shape[:2], n))
+        for rows in alike(seen):
+            run = self.course(seen[rows[0]])
+            parts = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
+            prior, e = filtered(self.A, self.C, run, *parts, self.x0)
+            xi[rows] = np.moveaxis(prior + applied(run.K, e), 0, 1)
+        return xi.reshape(*batch, -1, n)
 
     def inputs(self, u: Array, d: Array) -> Array:
         """Return B u + E d + offset, ``(*batch, n)``."""
@@ -138,11 +136,3 @@ class Innovations(NamedTuple):
         offset = T @ self.offset + shift - A @ shift
         ends = T @ self.L, self.S, T @ self.x0 + shift, T @ self.P0 @ T.T
         return Innovations(A, T @ self.B, T @ self.E, offset, self.C @ inverse, *ends)
-
-
-def _inverse(V: Array) -> Array:
-    """Return the pseudoinverse of a covariance, in unit variances."""
-    size = np.sqrt(np.maximum(np.diagonal(V), 0))
-    scale = np.divide(1, size, out=np.zeros_like(size), where=size > 0)
-    scale = scale[:, None] * scale
-    return scale * np.linalg.pinv(scale * V, SINGULAR, True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError
@@ -89,6 +90,16 @@ def named(
             raise QPError.expected(kind, f"{list(part)}", f"{size} names")
         names.append(tuple(part or (f"{letter}{i + 1}" for i in range(size))))
     return Log(trajectories, *names)
+
+
+def complete(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """Cut trajectories at rows with missing outputs."""
+    runs = []
+    for one in trajectories:
+        seen = np.concatenate(([False], one.y.isfinite().all(1).numpy(), [False]))
+        edges = np.flatnonzero(np.diff(seen)).reshape(-1, 2)
+        runs += [one.between(int(i), int(k) - 1) for i, k in edges if k - i > 1]
+    return runs
 
 
 def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:

@@ -21,8 +21,9 @@ def read_log(
 ) -> Log:
     """Read a log of a plant: row k has outputs y_k, the inputs u_k applied until k + 1, and d_k.
 
-    A trajectory ends at a gap in ``time``, where ``episode`` changes, and at a row with a missing
-    number. The last row of a trajectory needs only outputs.
+    A trajectory ends at a gap in ``time``, where ``episode`` changes, and at a row whose input or
+    known signal is missing. Missing outputs, such as of a sensor that answers in some rows only,
+    stay in it as NaN. Its first and last row have an output, and the last one needs no more.
 
     Args:
         data: the path of a CSV file, a DataFrame, a mapping of arrays ``(T,)`` or ``(T, n)``, or a
@@ -46,7 +47,7 @@ def read_log(
 
     Raises:
         QPError: a column is missing, named twice, without numbers or with text such as ``1,5`` or
-            ``3 kW``; the sampling time changes; or no two consecutive rows are complete.
+            ``3 kW``; the sampling time changes; or no rows have outputs and inputs between.
 
     Example:
         >>> import numpy as np, torch_qpmpc as qm

@@ -13,7 +13,6 @@ states. Signals are normalised, so that units decide nothing.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -21,30 +20,44 @@ import numpy as np
 import scipy  # imports its parts at their first use: a fifth of a second
 import torch
 
-from torch_qpmpc.identification.innovations import Array, Innovations
-from torch_qpmpc.identification.log import Trajectory, folds
+from torch_qpmpc.identification.filter import Array
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.likelihood import (
+    Noisy,
+    Signals,
+    batches,
+    em,
+    groups_of,
+    smooth,
+    starting,
+    steady,
+)
+from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.ridge import ridge
-from torch_qpmpc.qp.kernels.linalg import compiled
 
-#: Iterations of expectation maximisation, of a candidate and of the fit, and the gain of the
-#: log-likelihood per step that ends them.
-FEW, MANY, STALLED = 5, 20, 1e-5
-#: A covariance that changes by less than this share has settled.
-SAME = 1e-8
-#: The least variances of the noise of normalised states and outputs.
-FLOOR_Q, FLOOR_R = 1e-12, 1e-8
+#: Iterations of expectation maximisation, of a candidate and of the fit.
+FEW, MANY = 5, 20
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
 #: Candidates, as far as the data allow; 0 states are the outputs alone.
 ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20), (2, 5, 10, 20)
-#: Parts of the log in cross-validation, which cuts longer trajectories.
-PARTS, LONG = 2, 200
+#: Cross-validation leaves out every PARTS-th block of a log. Longer trajectories are cut into
+#: blocks of LONG steps, or fewer so that there are BLOCKS, but no shorter than SHORT.
+PARTS, BLOCKS, LONG, SHORT = 4, 12, 200, 10
 #: Steps of the predictions that decide.
 HORIZONS = (1, 2, 5, 10, 20)
-#: The smallest order is chosen whose squared errors are above the best's by less than this share,
-#: in the geometric mean. Errors below EXACT, as a share of the variance, are none.
-MARGIN, EXACT = 0.004, 1e-8
+#: Gaps of so many rows are filled for the starts of the fits, so many times by a model of so many
+#: states at most.
+FILLED, REFILLED, SMOOTHING = 20, 2, 6
+#: First steps of a trajectory in which its filter settles, at most a quarter: they decide nothing.
+SETTLING = 20
+#: Squared errors that differ by less than the share MARGIN, in the geometric mean, are equal, and
+#: so are those that differ by less than ERRORS standard errors and the share MOST. Errors below
+#: EXACT, as a share of the variance, are none.
+MARGIN, ERRORS, MOST, EXACT = 0.004, 2.0, 0.1, 1e-8
+#: Errors of a model that diverges, in standard deviations.
+WORST = 1e6
 #: Outputs may be unmoved if they are constant in this share of the steps; the number of past inputs
 #: in the test, and its level.
 CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
@@ -55,11 +68,15 @@ CORRELATIONS = 20
 
 
 class Candidate(NamedTuple):
-    """An order and lags, and the mean logarithm of held-out squared errors of unit variances."""
+    """An order and lags, and the mean logarithm of held-out squared errors of unit variances.
+
+    ``error`` is the standard error of the score's distance to the least one.
+    """
 
     order: int
     lags: int
     score: float
+    error: float = 0.0
 
 
 class Fit(NamedTuple):
@@ -77,32 +94,14 @@ class Fit(NamedTuple):
     candidates: tuple[Candidate, ...] = ()
 
 
-class Signals(NamedTuple):
-    """Normalised outputs ``(*batch, T + 1, n_y)`` and [u, d, 1] ``(*batch, T, n_v)``."""
-
-    y: Array
-    v: Array
-
-
-class Noisy(NamedTuple):
-    """The model of the likelihood; B has the columns of u, d and 1."""
-
-    A: Array
-    B: Array
-    C: Array
-    Q: Array
-    R: Array
-    m0: Array
-    P0: Array
-
-
 def fit_state_space(
     trajectories: Sequence[Trajectory], order: int | None = None, lags: int | None = None
 ) -> Fit:
     """Fit an innovations form to a log, whose first states are the outputs.
 
-    Order and lags have the least multi-step errors in parts of the log that a fit has not seen; of
-    orders that are nearly as good, the smallest.
+    Order and lags have the least multi-step errors in blocks of the log whose outputs a fit has not
+    seen, while the filter has; of orders as good within the error of their score, the smallest. An
+    output that is NaN is missing.
 
     Args:
         trajectories: the log.
@@ -112,53 +111,48 @@ def fit_state_space(
     """
     normal = _Normal(trajectories)
     data, rows = normal.apply(trajectories), ()
+    filled = _filled(data)
     if order is None or (lags is None and order):
         orders = ORDERS if order is None else (order,)
-        feasible = _feasible(data) if lags is None else (lags,)
-        short = [
-            one.between(first, min(first + LONG, one.steps))
-            for one in trajectories
-            for first in range(0, one.steps, LONG)
-        ]
-        parts = [normal.apply(part) for part in folds(short, PARTS)]
-        rows = tuple(_compare(parts, orders, feasible, order is None))
-        order, lags = _best(rows)[:2]
+        held = _Held(trajectories)
+        rows = tuple(_compare(data, filled, held, orders, lags, order is None))
+        best = min(equal_candidates(rows), key=lambda row: (row.order, row.score))
+        order, lags = best.order, best.lags
     if order:
-        par = em(_states(_predictor(data, lags or 0), order), data, MANY)
+        par = em(_states(_predictor(filled, lags or 0), order), data, MANY)
         model = readable(steady(par), data)
     else:
-        model = measured(data)
+        model = measured(data, filled)
     return Fit(normal.restore(model), order, lags or 0, rows)
 
 
 def held_out_errors(
     trajectories: Sequence[Trajectory], order: int, lags: int, horizon: int
 ) -> Array:
-    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their part.
+    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their outputs.
 
-    Those of the first ``lags`` steps of long trajectories, in which the filter settles, are left
-    out.
+    The filter knows the outputs before. Errors of the steps in which it settles are NaN.
     """
-    parts, errors = folds(trajectories, PARTS), []
-    for i, part in enumerate(parts):
-        others = [one for j, other in enumerate(parts) if j != i for one in other]
-        model = fit_state_space(others, order, lags).model
-        for e in _errors(model, part, horizon):
-            settled = lags if e.shape[1] > 2 * lags else 0
-            errors.append(e[:, settled:].reshape(-1, *e.shape[2:]))
-    return np.concatenate(errors)
+    held, total = _Held(trajectories), []
+    for one in trajectories:
+        total.append(np.full((one.steps, horizon, one.y.shape[1]), np.nan))
+    for part in range(PARTS):
+        model = fit_state_space(held.without(part, trajectories), order, lags).model
+        for i, e in enumerate(_errors(model, trajectories, horizon)):
+            mask = held.scored(i, part, horizon)
+            total[i][mask] = e[mask]
+    return np.concatenate(total)
 
 
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
-    errors = [e[:, :, 0] for e in _errors(model, trajectories, 1)]
-    whole, inside = np.concatenate([e.reshape(-1, e.shape[-1]) for e in errors]), []
-    mean, variance = whole.mean(0), whole.var(0)
+    errors = [e[:, 0] for e in _errors(model, trajectories, 1)]
+    whole, inside = np.concatenate(errors), []
+    mean, variance = np.nanmean(whole, 0), np.nanvar(whole, 0)
     for lag in range(1, CORRELATIONS + 1):
-        pairs = [(e[:, lag:] - mean) * (e[:, :-lag] - mean) for e in errors]
-        pairs = np.concatenate([x.reshape(-1, x.shape[-1]) for x in pairs])
-        size = variance * 1.96 * np.sqrt(max(len(pairs), 1))
-        inside.append(np.abs(pairs.sum(0)) <= size)
+        pairs = np.concatenate([(e[lag:] - mean) * (e[:-lag] - mean) for e in errors])
+        size = variance * 1.96 * np.sqrt(np.maximum(np.isfinite(pairs).sum(0), 1))
+        inside.append(np.abs(np.nansum(pairs, 0)) <= size)
     return np.mean(inside, 0)
 
 
@@ -169,15 +163,15 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
     or an input that is logged a row late.
     """
     n_y, n_u = len(model.C), model.B.shape[1]
-    parts = zip(_errors(model, trajectories, 1), _batches(_signals(trajectories)), strict=True)
-    pairs = (np.concatenate((e[:, :-1, 0], v[:, 1:, :n_u]), -1) for e, (_, v) in parts)
-    rows = np.concatenate([x.reshape(-1, n_y + n_u) for x in pairs])
+    parts = zip(_errors(model, trajectories, 1), trajectories, strict=True)
+    rows = np.concatenate([np.hstack((e[:-1, 0], one.u[1:])) for e, one in parts])
+    rows = rows[np.isfinite(rows).all(1)]
     if len(rows) <= n_u + 1:  # such as from trajectories of single steps
         return np.zeros(n_y)
     e, u = np.split(rows - rows.mean(0), [n_y], 1)
     left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
     before, after = (e**2).sum(0) / (len(rows) - 1), (left**2).sum(0) / (len(rows) - n_u - 1)
-    size = np.abs(np.concatenate([one.y.numpy() for one in trajectories])).max(0)
+    size = np.nanmax(np.abs(np.concatenate([one.y.numpy() for one in trajectories])), 0)
     noisy = before > (EXACT * size) ** 2
     return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
 
@@ -185,7 +179,7 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
     states = []
-    for y, v in _batches(_signals(trajectories)):
+    for _, y, v in batches(_signals(trajectories)):
         u, d = np.split(v, [model.B.shape[1]], -1)
         x = model.estimates(y, u, d)[..., :-1, :] @ model.A.T + model.inputs(u, d)
         states.append(x.reshape(-1, len(model.A)))
@@ -200,64 +194,142 @@ def _signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
 def _errors(
     model: Innovations, trajectories: Sequence[Trajectory], horizon: int
 ) -> Iterator[Array]:
-    """Yield multi-step errors ``(G, T, horizon, n_y)`` of the trajectories of each length."""
-    n_u = model.B.shape[1]
-    for y, v in _batches(_signals(trajectories)):
-        yield model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
+    """Return multi-step errors ``(T, horizon, n_y)`` of each trajectory."""
+    data, n_u = _signals(trajectories), model.B.shape[1]
+    errors: Any = [None] * len(data)
+    for places, y, v in batches(data):
+        many = model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
+        for i, e in zip(places, many, strict=True):
+            errors[i] = e
+    return errors
 
 
 # The choice
 
 
-def _feasible(data: Sequence[Signals]) -> tuple[int, ...]:
+class _Held:
+    """The blocks of a log whose outputs are left out of a fit, in turn."""
+
+    def __init__(self, trajectories: Sequence[Trajectory]) -> None:
+        steps = [one.steps for one in trajectories]
+        length = max(min(max(sum(steps) // BLOCKS, SHORT), LONG, sum(steps) // 2), 1)
+        self.rows: list[Array] = []
+        self.count = 0
+        for T in steps:
+            cuts = max(round(T / length), 1)
+            self.rows.append(self.count + np.arange(T + 1) * cuts // (T + 1))
+            self.count += cuts
+
+    def out(self, part: int, data: Sequence[Signals]) -> list[Signals]:
+        """Return normalised trajectories without the outputs of the part's blocks."""
+        masks = (rows % PARTS == part for rows in self.rows)
+        pairs = [(one, mask) for one, mask in zip(data, masks, strict=True) if not mask.all()]
+        return [one._replace(y=np.where(mask[:, None], np.nan, one.y)) for one, mask in pairs]
+
+    def without(self, part: int, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+        """Return the trajectories without the outputs of the part's blocks."""
+        kept = []
+        for one, rows in zip(trajectories, self.rows, strict=True):
+            out = torch.as_tensor(rows % PARTS == part)
+            if not out.all():
+                kept.append(one._replace(y=one.y.masked_fill(out[:, None], torch.nan)))
+        return kept
+
+    def targets(self, i: int, horizon: int) -> Array:
+        """Return the blocks of the targets of trajectory i, ``(T, horizon)``, -1 for none."""
+        rows = self.rows[i]
+        T = len(rows) - 1
+        target = np.arange(T)[:, None] + np.arange(1, horizon + 1)
+        block = np.where(target <= T, rows[np.minimum(target, T)], -1)
+        block[: min(SETTLING, T // 4)] = -1
+        return block
+
+    def scored(self, i: int, part: int, horizon: int) -> Array:
+        """Return True for the targets of trajectory i in the blocks of a part."""
+        block = self.targets(i, horizon)
+        return (block >= 0) & (block % PARTS == part)
+
+
+def _feasible(starts: Sequence[Sequence[Signals]]) -> tuple[int, ...]:
     """Return the lags whose windows are in at least half of the steps."""
-    total = sum(len(v) for _, v in data)
-    usable = {p: sum(max(len(v) - p, 0) for _, v in data) for p in LAGS}
-    width = data[0].y.shape[1] + data[0].v.shape[1]
-    return tuple(p for p in LAGS if usable[p] >= max(total / 2, 2 * width))[-3:]
+
+    def usable(data: Sequence[Signals], p: int) -> bool:
+        total, width = sum(len(v) for _, v in data), data[0].y.shape[1] + data[0].v.shape[1]
+        return sum(max(len(v) - p, 0) for _, v in data) >= max(total / 2, 2 * width)
+
+    return tuple(p for p in LAGS if all(usable(data, p) for data in starts))[-3:]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of candidates that diverge
 def _compare(
-    parts: list[list[Signals]], orders: Sequence[int], lags: Sequence[int], alone: bool
+    data: Sequence[Signals],
+    filled: Sequence[Signals],
+    held: _Held,
+    orders: Sequence[int],
+    lags: int | None,
+    alone: bool,
 ) -> list[Candidate]:
     """Return the candidates with their scores; ``alone`` are the outputs without a filter, too."""
-    folds = [
-        ([x for j, p in enumerate(parts) if j != i for x in p], _batches(part))
-        for i, part in enumerate(parts)
-    ]
-    rows = []
-    if alone or not lags:
-        rows.append(Candidate(0, 0, _score([measured(data) for data, _ in folds], folds)))
-        if rows[0].score <= np.log(EXACT) + MARGIN:
-            return rows
-    for p in lags:
-        starts = [_predictor(data, p) for data, _ in folds]
+    folds, bases = ([held.out(part, x) for part in range(PARTS)] for x in (data, filled))
+    found, sums = [], []
+
+    def add(n: int, p: int, models: Sequence[Innovations]) -> float:
+        found.append((n, p))
+        sums.append(_sums(models, data, held))
+        return _score(*(x.sum(0) for x in sums[-1]))
+
+    feasible = _feasible([_runs(base) for base in bases]) if lags is None else (lags,)
+    if alone or not feasible:
+        exact = add(0, 0, [*map(measured, folds, bases)])
+        if exact <= np.log(EXACT) + MARGIN:
+            return [Candidate(0, 0, exact)]
+    for p in feasible:
+        starts = [_predictor(base, p) for base in bases]
         best, misses = np.inf, 0
         for n in orders:
             if n <= min(len(start.s) for start in starts) and misses < PATIENCE:
                 pairs = zip(starts, folds, strict=True)
-                models = [steady(em(_states(start, n), data, FEW)) for start, (data, _) in pairs]
-                rows.append(Candidate(n, p, _score(models, folds)))
-                misses = 0 if rows[-1].score < best - MARGIN else misses + 1
-                best = min(best, rows[-1].score)
-    return rows
+                score = add(n, p, [steady(em(_states(one, n), fold, FEW)) for one, fold in pairs])
+                misses = 0 if score < best - MARGIN else misses + 1
+                best = min(best, score)
+    # The jackknife over the blocks gives the errors of the scores' distances.
+    scores = np.array([_score(*(x.sum(0) for x in parts)) for parts in sums])
+    used = np.flatnonzero(sums[0][1].any((1, 2)))
+    left = np.array([[_score(*(x.sum(0) - x[b] for x in parts)) for b in used] for parts in sums])
+    apart = left - left[scores.argmin()]
+    errors = np.sqrt((len(used) - 1) * apart.var(1))
+    return [Candidate(*x) for x in zip(*zip(*found, strict=True), scores, errors, strict=True)]
 
 
-def _score(models: list[Innovations], folds: list) -> float:
-    """Return the mean logarithm of the squared errors of all horizons and outputs."""
-    last, total, count = max(HORIZONS), np.zeros(()), np.zeros(())
-    for model, (_, batches) in zip(models, folds, strict=True):
-        for y, v in batches:
-            errors = model.errors(y, v, v[..., :0], last)[..., np.array(HORIZONS) - 1, :]
-            errors = errors.reshape(-1, *errors.shape[-2:])
-            total = total + np.nansum(errors**2, 0)
-            count = count + np.isfinite(errors).sum(0)
-    return float(np.log(np.maximum(total[count > 0] / count[count > 0], EXACT)).mean())
+def _sums(models: Sequence[Innovations], data: Sequence[Signals], held: _Held) -> tuple:
+    """Return the squared errors of the blocks ``(blocks, horizons, n_y)`` and their number."""
+    last, chosen, n_y = max(HORIZONS), np.array(HORIZONS) - 1, data[0].y.shape[1]
+    total, count = np.zeros((2, held.count + 1, len(HORIZONS), n_y))
+    for part, model in enumerate(models):
+        for places, y, v in batches(data):
+            many = model.errors(y, v, v[..., :0], last)[..., chosen, :]
+            for i, e in zip(places, many, strict=True):
+                block = held.targets(i, last)[:, chosen]
+                block = np.where(block % PARTS == part, block, -1)
+                for h, steps in enumerate(HORIZONS):
+                    seen = np.isfinite(data[i].y[np.minimum(np.arange(len(e)) + steps, len(e))])
+                    off = np.where(np.abs(e[:, h]) < WORST, e[:, h], WORST)
+                    np.add.at(total[:, h], block[:, h], np.where(seen, off, 0.0) ** 2)
+                    np.add.at(count[:, h], block[:, h], seen)
+    return total[:-1], count[:-1]
 
 
-def _best(rows: Sequence[Candidate]) -> Candidate:
-    limit = min(row.score for row in rows) + MARGIN
-    return min((row for row in rows if row.score <= limit), key=lambda row: (row.order, row.score))
+def _score(total: Array, count: Array) -> float:
+    """Return the mean logarithm of the mean squared errors of all horizons and outputs."""
+    seen = count > 0
+    return float(np.log(np.maximum(total[seen] / count[seen], EXACT)).mean())
+
+
+def equal_candidates(rows: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates whose scores are the least one within its error."""
+    least = min((row.score for row in rows), default=0.0)
+    errors = {row: max(MARGIN, min(ERRORS * row.error, MOST)) for row in rows}
+    return [row for row in rows if row.score <= least + errors[row]]
 
 
 # Normalised signals
@@ -272,7 +344,7 @@ class _Normal:
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
         self.apart, self.n_u = _unmoved(trajectories), trajectories[0].u.shape[1]
         y = np.concatenate([x.y.numpy() for x in trajectories])
-        held = [x.y.numpy()[:, self.apart] for x in trajectories]
+        held = [continued(x.y.numpy()[:, self.apart]) for x in trajectories]
         self.first = np.array([x[0] for x in held])
         self.changes = np.concatenate([np.diff(x, axis=0) for x in held])
         self.y, self.y_size = _scale(y[:, ~self.apart])
@@ -280,7 +352,7 @@ class _Normal:
 
     def _known(self, one: Trajectory) -> Array:
         y, u, d = (x.numpy() for x in one)
-        return np.hstack((u, d, y[:-1, self.apart]))
+        return np.hstack((u, d, continued(y[:-1, self.apart])))
 
     def apply(self, trajectories: Sequence[Trajectory]) -> list[Signals]:
         """Return the signals."""
@@ -339,16 +411,17 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     Changes of an output that is constant in most steps, such as a set-point, are regressed on the
     last inputs and their squares. An F-test of 1 % decides whether these explain them.
     """
-    changes = np.concatenate([np.diff(x.y.numpy(), axis=0) for x in trajectories])
+    outputs = [continued(x.y.numpy()) for x in trajectories]
+    changes = np.concatenate([np.diff(y, axis=0) for y in outputs])
     unmoved: Any = ~(changes != 0).any(0)
     seldom = np.flatnonzero(~unmoved & ((changes == 0).mean(0) >= CONSTANT))
-    use = [x for x in trajectories if x.steps > LAST]
+    use = [(x.u.numpy(), y) for x, y in zip(trajectories, outputs, strict=True) if x.steps > LAST]
     if not len(seldom) or not use:
         return unmoved & ~unmoved.all()
-    windows = [np.lib.stride_tricks.sliding_window_view(x.u.numpy(), LAST, 0) for x in use]
+    windows = [np.lib.stride_tricks.sliding_window_view(u, LAST, 0) for u, _ in use]
     U = np.concatenate([w.reshape(len(w), -1) for w in windows])
     U = np.hstack((np.ones((len(U), 1)), U, U**2))
-    after = np.concatenate([np.diff(x.y.numpy()[LAST - 1 :, seldom], axis=0) for x in use])
+    after = np.concatenate([np.diff(y[LAST - 1 :, seldom], axis=0) for _, y in use])
     for i, target in zip(seldom, after.T, strict=True):
         rest = target - U @ np.linalg.lstsq(U, target, rcond=None)[0]
         m, left = U.shape[1] - 1, len(U) - U.shape[1]
@@ -360,25 +433,80 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     return unmoved & ~unmoved.all()
 
 
+def continued(y: Array) -> Array:
+    """Return outputs with the last ones in place of the missing, or else the next ones."""
+    seen, rows = np.isfinite(y), np.arange(len(y))[:, None]
+    last = np.maximum.accumulate(np.where(seen, rows, -1))
+    last = np.where(last < 0, seen.argmax(0), last)
+    return np.nan_to_num(np.take_along_axis(y, last, 0)) if len(y) else y
+
+
 def _scale(x: Array) -> tuple[Array, Array]:
-    mean, size = x.mean(0), x.std(0)
+    mean, size = np.nanmean(x, 0), np.nanstd(x, 0)
     return mean, np.where(size > 1e-12 * np.abs(mean), size, 1.0)
 
 
 # Starts
 
 
-def measured(data: Sequence[Signals]) -> Innovations:
-    """Return the model whose states are the outputs, by ridge regression on single steps."""
+def _runs(data: Sequence[Signals]) -> list[Signals]:
+    """Return the parts of the trajectories in which all outputs are seen."""
+    runs = []
+    for y, v in data:
+        seen = np.concatenate(([False], np.isfinite(y).all(1), [False]))
+        for i, k in np.flatnonzero(np.diff(seen)).reshape(-1, 2):
+            runs.append(Signals(y[i:k], v[i : k - 1]))
+    return [one for one in runs if len(one.v)]
+
+
+def _filled(data: Sequence[Signals]) -> list[Signals]:
+    """Return the trajectories with gaps of outputs up to FILLED rows filled, for the starts.
+
+    They are filled along lines, and again by the smoothed outputs of a model that starts from that.
+    """
+    filled, gaps = [], []
+    for y, v in data:
+        rows, whole = np.arange(len(y)), y.copy()
+        for i, column in enumerate(y.T):
+            seen = np.flatnonzero(np.isfinite(column))
+            if 1 < len(seen) < len(y):
+                after = np.searchsorted(seen, rows).clip(1, len(seen) - 1)
+                between = (rows > seen[0]) & (rows < seen[-1]) & np.isnan(column)
+                near = between & (seen[after] - seen[after - 1] <= FILLED + 1)
+                whole[near, i] = np.interp(rows[near], seen, column[seen])
+        filled.append(Signals(whole, v))
+        gaps.append(np.isnan(y) & np.isfinite(whole))
+    if not any(gap.any() for gap in gaps):
+        return filled
+    for _ in range(REFILLED):
+        if not (lags := _feasible([_runs(filled)])):
+            break
+        start = _predictor(filled, lags[-1])
+        par = em(_states(start, min(len(start.s), SMOOTHING)), data, FEW)
+        for group in groups_of(data):
+            smooth_y = smooth(par, group).x @ par.C.T
+            for place, y in zip(group.places, smooth_y, strict=True):
+                filled[place].y[gaps[place]] = y[gaps[place]]
+    return filled
+
+
+def measured(data: Sequence[Signals], filled: Sequence[Signals]) -> Innovations:
+    """Return the model whose states are the outputs, by ridge regression on single steps.
+
+    If too few steps have all outputs, gaps are ``filled``.
+    """
     n = data[0].y.shape[1]
+    data = _runs(data)
+    if sum(len(v) for _, v in data) <= n + filled[0].v.shape[1]:
+        data = _runs(filled)
     X = np.concatenate([np.hstack((y[:-1], v)) for y, v in data])
     Y = np.concatenate([y[1:] for y, _ in data])
     W = ridge(torch.as_tensor(X), torch.as_tensor(Y)).numpy().T
     e = Y - X @ W.T
     S, one, none = e.T @ e / len(e), np.eye(n), np.zeros((n, 0))
-    first = np.array([y[0] for y, _ in data])
-    P0 = np.cov(first.T, bias=True).reshape(n, n) - S
-    return Innovations(W[:, :n], W[:, n:], none, np.zeros(n), one, one, S, first.mean(0), P0)
+    first, every = (np.concatenate(x) for x in ([y[:1] for y, _ in data], [y for y, _ in data]))
+    mean, P0 = starting(first, every)
+    return Innovations(W[:, :n], W[:, n:], none, np.zeros(n), one, one, S, mean, P0 - S)
 
 
 class _Predictor(NamedTuple):
@@ -396,7 +524,7 @@ def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
     """Fit an ARX model of ``lags`` and decompose its predictions of as many steps."""
     n_y = data[0].y.shape[1]
     windows, after = [], []
-    for y, v in data:
+    for y, v in _runs(data):
         if len(v) >= lags:
             w = np.hstack((y[:-1], v[:, :-1]))
             count = len(w) - lags + 1
@@ -407,9 +535,10 @@ def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
     G, q = np.zeros((lags * n_y, Z.shape[1])), Z.shape[1] // lags
     for f in range(lags):
         G[f * n_y : (f + 1) * n_y, f * q :] = W[: (lags - f) * q].T
+    first = np.mean([y[0] for y, _ in _runs(data)], 0)
     _, s, Vh = np.linalg.svd(np.linalg.qr(Z, mode="r") @ G.T, full_matrices=False)
     s = s[s > 1e-9 * s[0]] / np.sqrt(len(Z))
-    return _Predictor(windows, after, Vh, s, G, np.mean([y[0] for y, _ in data], 0))
+    return _Predictor(windows, after, Vh, s, G, first)
 
 
 def _states(predictor: _Predictor, order: int) -> Noisy:
@@ -427,180 +556,10 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
     return Noisy(AB[:, :order], AB[:, order:], C, Q, R, np.linalg.pinv(C) @ first, np.eye(order))
 
 
-# Maximum likelihood
-
-
-class _Moments(NamedTuple):
-    """Smoothed means ``(G, T + 1, n)``, their covariances ``(T + 1, n, n)`` and neighbours'."""
-
-    x: Array
-    P: Array
-    cross: Array
-    likelihood: float
-
-
-def smooth(par: Noisy, y: Array, v: Array) -> _Moments:
-    """Smooth trajectories of equal length, y ``(G, T + 1, n_y)``."""
-    A, B, C, Q, R, m, P = par
-    (G, N, n_y), n = y.shape, len(A)
-    before, after = np.empty((N, n, n)), np.empty((N, n, n))
-    L, inverse, half = np.empty((N, n, n_y)), np.empty((N, n_y, n_y)), np.empty(N)
-    steady = N
-    for t in range(N):
-        before[t] = A @ after[t - 1] @ A.T + Q if t else P
-        change = np.abs(before[t] - before[t - 1]).max()
-        if t > 1 and change <= SAME * np.abs(before[t]).max():
-            for part in (before, after, L, inverse, half):
-                part[t:] = part[t - 1]
-            steady = t
-            break
-        V = C @ before[t] @ C.T + R
-        inverse[t], half[t] = np.linalg.inv(V), np.linalg.slogdet(V)[1]
-        L[t] = before[t] @ C.T @ inverse[t]
-        P = before[t] - L[t] @ V @ L[t].T
-        after[t] = (P + P.T) / 2
-    y = np.moveaxis(y, 0, 1)
-    moved = np.moveaxis(v @ B.T, 0, 1) + _apply(A @ L, y)[:-1]
-    # Copies are contiguous, or the kernels would be compiled for each layout.
-    start = np.broadcast_to(m, (G, n)).copy()
-    prior = recursion((A - A @ L @ C)[:-1].copy(), moved.copy(), start)
-    e = y - prior @ C.T
-    post = prior + _apply(L, e)
-    value = -(half.sum() * G + (_apply(inverse, e) * e).sum()) / 2
-    J = np.linalg.solve(before[1 : steady + 1], A @ after[:steady][: N - 1]).swapaxes(-1, -2)
-    J = J[np.arange(N - 1).clip(max=len(J) - 1)]
-    back = (post[:-1] - _apply(J, prior[1:]))[::-1].copy()
-    x = recursion(J[::-1].copy(), back, post[-1].copy())[::-1]
-    own = after[:-1] - J @ before[1:] @ J.swapaxes(-1, -2)
-    Ps = spread(J.copy(), own.copy(), after[-1])
-    return _Moments(np.moveaxis(x, 0, 1), Ps, Ps[1:] @ J.swapaxes(-1, -2), float(value))
-
-
-def _apply(M: Array, x: Array) -> Array:
-    """Return the products of x ``(T, G, n)`` with the matrices of each step ``(T, .., n)``."""
-    return np.matmul(M[:, None], x[..., None])[..., 0]
-
-
-@compiled
-def recursion(M, c, z):
-    """Return z_0 = z and z_{t+1} = M_t z_t + c_t, ``(T + 1, G, n)``."""
-    T, G, n = c.shape
-    out = np.empty((T + 1, G, n))
-    for i in range(G):
-        for j in range(n):
-            out[0, i, j] = z[i, j]
-    for t in range(T):
-        for i in range(G):
-            for j in range(n):
-                total = c[t, i, j]
-                for k in range(n):
-                    total += M[t, j, k] * out[t, i, k]
-                out[t + 1, i, j] = total
-    return out
-
-
-@compiled
-def spread(J, own, last):
-    """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, n, n)``."""
-    T, n, _ = own.shape
-    out, half = np.empty((T + 1, n, n)), np.empty((n, n))
-    for j in range(n):
-        for k in range(n):
-            out[T, j, k] = last[j, k]
-    for t in range(T - 1, -1, -1):
-        for j in range(n):
-            for k in range(n):
-                half[j, k] = 0.0
-                for m in range(n):
-                    half[j, k] += J[t, j, m] * out[t + 1, m, k]
-        for j in range(n):
-            for k in range(n):
-                total = own[t, j, k]
-                for m in range(n):
-                    total += half[j, m] * J[t, k, m]
-                out[t, j, k] = total
-    return out
-
-
-def _batches(data: Sequence[Signals]) -> list[Signals]:
-    """Return trajectories of the same length together."""
-    groups: dict[int, list[Signals]] = defaultdict(list)
-    for one in data:
-        groups[len(one.v)].append(one)
-    return [Signals(*map(np.stack, zip(*group, strict=True))) for group in groups.values()]
-
-
-def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
-    """Raise the likelihood by expectation maximisation."""
-    batches, before = _batches(data), -np.inf
-    steps = sum(len(y) for y, _ in data)
-    for _ in range(iterations):
-        moments = [smooth(par, y, v) for y, v in batches]
-        value = sum(m.likelihood for m in moments) / steps
-        if value - before < STALLED:
-            break
-        before, par = value, _maximise(batches, moments)
-    return par
-
-
-def _maximise(batches: list[Signals], moments: list[_Moments]) -> Noisy:
-    Szz: Any = 0.0
-    Sx1 = S11 = Syx = Sxx = Syy = first = Szz
-    N, M, n = 0, 0, moments[0].x.shape[-1]
-    for (y, v), (x, P, cross, _) in zip(batches, moments, strict=True):
-        G = len(y)
-        z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
-        x1, all_x, ys = x[:, 1:].reshape(-1, n), x.reshape(-1, n), y.reshape(-1, y.shape[-1])
-        zz, xz = z.T @ z, x1.T @ z
-        zz[:n, :n] += G * P[:-1].sum(0)
-        xz[:, :n] += G * cross.sum(0)
-        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum(0)
-        Syx, Syy = Syx + ys.T @ all_x, Syy + ys.T @ ys
-        Sxx = Sxx + all_x.T @ all_x + G * P.sum(0)
-        N, M = N + len(x1), M + len(ys)
-    count = sum(len(m.x) for m in moments)
-    m0: Any = sum(m.x[:, 0].sum(0) for m in moments) / count
-    for m in moments:
-        first = first + (m.x[:, 0] - m0).T @ (m.x[:, 0] - m0) + len(m.x) * m.P[0]
-    P0 = first / count
-    AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
-    C = np.linalg.solve(_lifted(Sxx), Syx.T).T
-    Q = _positive((S11 - AB @ Sx1.T) / N, FLOOR_Q)
-    R = _positive((Syy - C @ Syx.T) / M, FLOOR_R)
-    return Noisy(AB[:, :n], AB[:, n:], C, Q, R, m0, _positive(P0, FLOOR_Q))
-
-
-def _lifted(S: Array) -> Array:
-    return S + 1e-9 * np.trace(S) / len(S) * np.eye(len(S))
-
-
-def _positive(M: Array, floor: float) -> Array:
-    w, v = np.linalg.eigh((M + M.T) / 2)
-    return (v * np.maximum(w, floor)) @ v.T
-
-
-# The filter
-
-
-def steady(par: Noisy) -> Innovations:
-    """Return the filter's steady state."""
-    A, B, C, Q, R, m0, P0 = par
-    try:
-        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
-    except (ValueError, np.linalg.LinAlgError):  # a mode that nothing excites settles slowly
-        P = Q
-        for _ in range(1000):
-            P = A @ (P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)) @ A.T + Q
-            P = (P + P.T) / 2
-    S = C @ P @ C.T + R
-    L = np.linalg.solve(S, C @ P).T
-    return Innovations(A, B, B[:, :0], np.zeros(len(A)), C, L, S, m0, P0 - P)
-
-
 def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
     """Return the model with the outputs as the first states, and others of unit variance."""
     n, C = len(model.A), model.C
-    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for y, v in _batches(data)]
+    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for _, y, v in batches(data)]
     cov = np.cov(np.concatenate(xi).T, bias=True).reshape(n, n)
     root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(n))
     _, s, Vh = np.linalg.svd(C @ root)

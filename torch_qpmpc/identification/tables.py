@@ -71,19 +71,27 @@ def _split(
     """Return the trajectories in rows ``values`` [y, u, d], the time of a step, and a note."""
     n_y = sizes[0]
     fits = np.abs(values) <= LARGEST  # False for NaN
-    whole, measured = fits.all(1), fits[:, :n_y].all(1)
+    known, measured = fits[:, n_y:].all(1), fits[:, :n_y].any(1)
     inside = marks[1:] == marks[:-1]
     gaps, dt = gaps_of(times, inside, marks, unit)
-    steps = whole[:-1] & measured[1:] & inside & ~gaps
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
-    if not len(edges):
-        got = f"{len(values)} rows, of which no two in a row are complete"
-        raise QPError.expected("data", got, "consecutive rows with a number in each column")
-    used = np.concatenate((steps, [False])) | np.concatenate(([False], steps))
+    steps = known[:-1] & inside & ~gaps
+    runs = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
+    edges, used = [], np.zeros(len(values), bool)
+    for i, k in runs:  # from the first row with an output to the last
+        rows = i + np.flatnonzero(measured[i : k + 1])
+        if len(rows) > 1:
+            edges.append((rows[0], rows[-1]))
+            used[rows[0] : rows[-1] + 1] = True
+    if not edges:
+        got = f"{len(values)} rows, of which no two have outputs and all inputs between them"
+        raise QPError.expected("data", got, "rows with a number in each column")
     y, u, d = torch.as_tensor(values).split(sizes, dim=1)
-    trajectories = [Trajectory(y[i : k + 1], u[i:k], d[i:k]) for i, k in edges.tolist()]
+    y = y.masked_fill(~torch.as_tensor(fits[:, :n_y]), torch.nan)
+    trajectories = [Trajectory(y[i : k + 1], u[i:k], d[i:k]) for i, k in edges]
     counted = f"{_count(gaps.sum(), 'gap')}, {_count(len(edges), 'trajectory')}"
     note = f"{_count(len(values), 'row')}: {counted}, {1 - used.mean():.1%} of rows dropped"
+    if missing := (~fits[used, :n_y]).mean():
+        note += f", {missing:.1%} of outputs missing"
     return trajectories, dt, note
 
 

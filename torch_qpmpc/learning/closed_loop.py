@@ -153,11 +153,14 @@ class _Course:
         names = ("A", "B", "E", "offset", "C", "x0")
         parts = ([getattr(x, name) for x in models] for name in names)
         self.A, self.B, self.E, self.offset, self.C, self.x0 = map(_stacked, parts)
-        courses = [[*model.settling(STEPS), (model.L, model.S)] for model in models]
-        longest = max(map(len, courses))
-        courses = [course + course[-1:] * (longest - len(course)) for course in courses]
-        self.gains = _stacked([np.array([L for L, _ in course]) for course in courses])
-        self.roots = _stacked([np.array([_root(V) for _, V in course]) for course in courses])
+        runs = [model.settling(STEPS) for model in models]
+        rows = np.arange(max(len(gains) for gains, _ in runs) + 1)
+        gains, roots = [], []
+        for model, (L, V) in zip(models, runs, strict=True):
+            gains.append(np.concatenate((L, model.L[None]))[np.minimum(rows, len(L))])
+            V = np.concatenate((V, model.S[None]))
+            roots.append(np.array([_root(x) for x in V])[np.minimum(rows, len(L))])
+        self.gains, self.roots = _stacked(gains), _stacked(roots)
 
     def at(self, name: str, x: Tensor, k: Tensor | None = None) -> Tensor:
         """Return the product of each loop's matrix, that of step k, and x ``(count, n)``."""

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch_qpmpc.checks import check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import check_excitation
-from torch_qpmpc.identification.log import Trajectory, folds
+from torch_qpmpc.identification.log import Trajectory, complete, folds
 from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.identification.ridge import ridge
 from torch_qpmpc.mpc.layout import Layout, banded_matrix
@@ -179,7 +179,7 @@ def identify_blended(
         raise QPError.expected("trajectories", got, "outputs and actions only")
     layout = Layout(len(log.outputs), len(log.inputs), int(horizon))
     check_excitation(log)
-    data, coefficients = log.trajectories, layout.n + 1
+    data, coefficients = complete(log.trajectories), layout.n + 1
     if isinstance(centres, Integral):
         return _fit(data, layout, int(centres))
     counts = [count for count in counts if count * coefficients < log.steps] or [min(counts)]

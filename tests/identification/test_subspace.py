@@ -1,0 +1,164 @@
+"""Order, starts and missing outputs of identified models, on logs as people have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.signal
+
+import torch_qpmpc as qm
+from torch_qpmpc.identification import subspace
+from torch_qpmpc.identification.identification import Identified
+from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.likelihood import Noisy, Signals, groups_of, smooth
+
+
+def tank(rows: int, hold: int, seed: int, start: float = 0.0, noise: float = 0.05) -> dict:
+    """Return the log of two tanks in a row, of 60 and 5 steps, in steps of the valve."""
+    rng, u, k = np.random.default_rng(seed), np.zeros((rows, 1)), 0
+    while k < rows:
+        length = int(hold * rng.uniform(0.6, 1.4))
+        u[k : k + length], k = rng.choice([0, 30, 60, 100.0]), k + length
+    first = last = start
+    y = np.zeros((rows + 1, 1))
+    for k in range(rows + 1):
+        y[k] = 5 + last + noise * rng.normal()
+        if k < rows:
+            first, last = first + (0.3 * u[k, 0] - first) / 60, last + (first - last) / 5
+    return {"y": y, "u": u}
+
+
+def arm(rows: int, seed: int, sweep: bool) -> dict:
+    """Return the log of two lightly damped modes, in a sweep or in steps."""
+    rng, t = np.random.default_rng(seed), np.arange(rows)
+    u = np.sin(2 * np.pi * (0.003 * t + 0.1 / rows * t * t))
+    if not sweep:
+        u = rng.choice([-1, 1.0], rows // 4 + 1).repeat(4)[:rows]
+    y = np.zeros(rows + 1)
+    for w, z, gain in ((0.35, 0.01, 1.0), (0.9, 0.007, 0.5)):
+        a = np.exp(-z * w)
+        den = [1, -2 * a * np.cos(w), a * a]
+        y[1:] += gain * scipy.signal.lfilter([sum(den)], den, u)
+    return {"y": (y + 2e-3 * rng.normal(size=rows + 1))[:, None], "u": u[:, None]}
+
+
+def off(found: Identified, log: dict, ahead: int = 20) -> float:
+    """Return the RMSE ahead, after the filter has settled, on a new log."""
+    y, u = log["y"], log["u"]
+    errors = found.model.errors(y, u, np.zeros((len(u), 0)), ahead)[40:, -1]
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+@pytest.mark.parametrize(
+    ("log", "new", "order"),
+    [
+        (tank(160, 45, 21), tank(300, 45, 4), 2),
+        (tank(400, 80, 5, noise=0.3), tank(300, 45, 6, noise=0.3), 2),
+        (arm(400, 7, True), arm(300, 8, False), 4),
+    ],
+    ids=["a step test in one piece", "with much noise", "a sweep"],
+)
+def test_the_order_of_a_short_log_in_one_piece_is_enough(log, new, order):
+    found, told = qm.identify(log), qm.identify(log, order=order)
+    assert order <= found.fit.order
+    assert off(found, new) < 1.2 * off(told, new)
+    assert found.R2[-1].item() > 0.99 * (1 - off(told, new) ** 2 / log["y"].var())
+
+
+def test_the_report_names_orders_that_the_log_does_not_tell_apart():
+    rows = [(0, 0, 3.0, 0.1), (1, 2, 0.05, 0.04), (2, 2, 0.0, 0.0), (3, 2, 0.003, 0.0)]
+    rows = [subspace.Candidate(*row) for row in rows]
+    assert [row.order for row in subspace.equal_candidates(rows)] == [1, 2, 3]
+    far = rows[1]._replace(score=0.15, error=0.2)
+    assert [row.order for row in subspace.equal_candidates([far, rows[2]])] == [2], "5 % at most"
+
+
+@pytest.mark.parametrize("pieces", [1, 4])
+def test_a_simulation_may_start_anywhere_in_the_range_of_the_log(pieces):
+    found = qm.identify([tank(800 // pieces, 60, seed) for seed in range(pieces)], order=2)
+    model, (y, u) = found.model, tank(150, 60, 99, start=25.0).values()
+    inputs = model.inputs(u, np.zeros((len(u), 0)))
+    for w in (1, 5, 20, 40):
+        rows, right, power, moved = [], [], np.eye(2), np.zeros(2)
+        for k in range(w):
+            rows.append(model.C @ power)
+            right.append(y[k] - model.C @ moved)
+            power, moved = model.A @ power, model.A @ moved + inputs[k]
+        x, own = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0], []
+        for k in range(w + 50):
+            own.append(model.C @ x)
+            x = model.A @ x + inputs[k]
+        found_off, own_off = (
+            np.sqrt(np.mean((np.asarray(z)[w : w + 50] - y[w : w + 50]) ** 2))
+            for z in (found.simulate(u, y[:w]), own)
+        )
+        assert found_off < 1.5 * own_off + 0.02
+
+
+@pytest.mark.parametrize("kind", ["a fifth", "every third row"])
+def test_missing_outputs_cost_only_their_information(kind):
+    log, new = tank(900, 40, 11), tank(300, 45, 12)
+    y, rng = log["y"].copy(), np.random.default_rng(13)
+    gone = rng.random(len(y)) < 0.2 if kind == "a fifth" else np.arange(len(y)) % 3 > 0
+    y[gone] = np.nan
+    found = qm.identify({"y": y, "u": log["u"]})
+    assert len(found.log.trajectories) == 1
+    assert off(found, new) < 1.15 * off(qm.identify(log, order=2), new)
+    assert "outputs missing" in str(found)
+
+
+def test_smoothed_states_are_the_means_given_the_outputs_that_are_there():
+    """States and outputs are one Gaussian vector: its conditional moments are exact."""
+    rng, n, n_y, T = np.random.default_rng(0), 3, 2, 9
+    A, B, C = 0.4 * rng.normal(size=(n, n)), rng.normal(size=(n, 1)), rng.normal(size=(n_y, n))
+    Q, R, m, P0 = 0.3 * np.eye(n) + 0.1, np.array([[0.5, 0.2], [0.2, 0.4]]), np.ones(n), np.eye(n)
+    y, v = rng.normal(size=(T, n_y)), np.ones((T - 1, 1))
+    y[[0, 2, 5, 5, 6], [1, 0, 0, 1, 1]] = np.nan
+    found = smooth(Noisy(A, B, C, Q, R, m, P0), groups_of([Signals(y, v)])[0])
+    mean, cov = [m], [P0]
+    for _ in range(T - 1):
+        mean.append(A @ mean[-1] + B[:, 0])
+        cov.append(A @ cov[-1] @ A.T + Q)
+    whole = np.zeros((T, n, T, n))
+    for i in range(T):
+        part = cov[i]
+        for j in range(i, T):
+            whole[j, :, i], whole[i, :, j] = part, part.T
+            part = A @ part
+    whole = whole.reshape(T * n, T * n)
+    seen = np.isfinite(y).ravel()
+    H, V = np.kron(np.eye(T), C)[seen], np.kron(np.eye(T), R)[np.ix_(seen, seen)]
+    V = H @ whole @ H.T + V
+    e, K = y.ravel()[seen] - H @ np.concatenate(mean), whole @ H.T @ np.linalg.inv(V)
+    exact = (whole - K @ H @ whole).reshape(T, n, T, n)
+    x = (np.concatenate(mean) + K @ e).reshape(1, T, n)
+    np.testing.assert_allclose(found.x, x, atol=1e-10)
+    for k in range(T):
+        np.testing.assert_allclose(found.P[k], exact[k, :, k], atol=1e-10)
+    for k in range(T - 1):
+        np.testing.assert_allclose(found.cross[k], exact[k + 1, :, k], atol=1e-10)
+    likelihood = -(np.linalg.slogdet(V)[1] + e @ np.linalg.solve(V, e)) / 2
+    assert found.likelihood == pytest.approx(likelihood)
+
+
+def test_estimates_of_the_innovations_form_are_those_of_the_textbook_filter_with_gaps():
+    rng = np.random.default_rng(1)
+    A, C = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[1.0, 0.0], [0.3, 1.0]])
+    Q, R = np.diag([0.05, 0.02]), np.array([[0.1, 0.02], [0.02, 0.3]])
+    steady = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    S = C @ steady @ C.T + R
+    L, none, start = steady @ C.T @ np.linalg.inv(S), np.zeros((2, 0)), np.array([1.0, -1.0])
+    form = Innovations(A, none, none, np.zeros(2), C, L, S, start, 4 * np.eye(2) - steady)
+    y = rng.normal(size=(2, 40, 2))
+    y[0, 5:12], y[0, 20:, 1], y[1, ::3, 0] = np.nan, np.nan, np.nan
+    xi = form.estimates(y, *np.zeros((2, 2, 39, 0)))
+    for own, one in zip(xi, y, strict=True):
+        x, P = start, 4 * np.eye(2)
+        for row, estimate in zip(one, own, strict=True):
+            seen = np.isfinite(row)
+            H, V = C[seen], R[np.ix_(seen, seen)]
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + V)
+            x, P = x + K @ (row[seen] - H @ x), P - K @ H @ P
+            np.testing.assert_allclose(estimate, x, atol=1e-9)
+            x, P = A @ x, A @ P @ A.T + Q

@@ -1,0 +1,183 @@
+"""Maximum likelihood of a linear model with noise, by expectation maximisation."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy  # imports its parts at their first use: a fifth of a second
+
+from torch_qpmpc.identification.filter import (
+    SAME,
+    Array,
+    Course,
+    Smoothed,
+    alike,
+    course,
+    filtered,
+    smoothed,
+)
+from torch_qpmpc.identification.innovations import Innovations
+
+#: The gain of the log-likelihood per step that ends expectation maximisation.
+STALLED = 1e-5
+#: The least variances of the noise of normalised states and outputs.
+FLOOR_Q, FLOOR_R = 1e-12, 1e-8
+
+
+class Signals(NamedTuple):
+    """Normalised outputs ``(*batch, T + 1, n_y)`` and [u, d, 1] ``(*batch, T, n_v)``."""
+
+    y: Array
+    v: Array
+
+
+class Noisy(NamedTuple):
+    """The model of the likelihood; B has the columns of u, d and 1."""
+
+    A: Array
+    B: Array
+    C: Array
+    Q: Array
+    R: Array
+    m0: Array
+    P0: Array
+
+
+def batches(data: Sequence[Signals]) -> list[tuple[list[int], Array, Array]]:
+    """Return trajectories of the same length together, with their places."""
+    groups: dict[int, list[int]] = defaultdict(list)
+    for i, one in enumerate(data):
+        groups[len(one.v)].append(i)
+    return [
+        (group, *map(np.stack, zip(*(data[i] for i in group), strict=True)))
+        for group in groups.values()
+    ]
+
+
+class Group(NamedTuple):
+    """Trajectories ``(G, T + 1, ..)`` with the same missing outputs.
+
+    ``kinds`` are the rows ``(K, n_y)`` of outputs that are seen together, ``kind`` ``(T + 1,)``
+    the one of each step; ``places`` are those of the trajectories in the log.
+    """
+
+    y: Array
+    v: Array
+    kinds: Array
+    kind: Array
+    places: list[int]
+
+
+def groups_of(data: Sequence[Signals]) -> list[Group]:
+    groups = []
+    for places, y, v in batches(data):
+        for rows in alike(np.isnan(y)):
+            seen = ~np.isnan(y[rows[0]])
+            kinds, kind = np.unique(seen @ 2.0 ** np.arange(y.shape[-1]), return_inverse=True)
+            first = [int((kind == i).argmax()) for i in range(len(kinds))]
+            own = [places[i] for i in rows]
+            groups.append(Group(y[rows], v[rows], seen[first], kind, own))
+    return groups
+
+
+def smooth(par: Noisy, group: Group) -> Smoothed:
+    """Smooth trajectories."""
+    A, B, C, Q, R, m, P = par
+    none, zero = np.zeros_like(A), np.zeros_like(C.T)
+    parts = map(np.ascontiguousarray, (A, C, none, zero, Q, R, zero, P))
+    run = Course(*course(*parts, group.kinds[group.kind], SAME))
+    y, moved = np.moveaxis(group.y, 0, 1), np.moveaxis(group.v @ B.T, 0, 1)
+    return smoothed(A, C, run, *filtered(A, C, run, y, moved, m))
+
+
+def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
+    """Raise the likelihood by expectation maximisation."""
+    groups, before = groups_of(data), -np.inf
+    steps = sum(len(y) for y, _ in data)
+    for _ in range(iterations):
+        moments = [smooth(par, group) for group in groups]
+        value = sum(m.likelihood for m in moments) / steps
+        if not value - before >= STALLED:  # or it is NaN
+            break
+        before, par = value, _maximise(groups, moments)
+    return par
+
+
+def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
+    """Return the likeliest parameters given the moments of the states.
+
+    An output's row of C is fitted to the steps in which it is seen, and an entry of R to those in
+    which both outputs are. To the first states one more is added, anywhere in the log.
+    """
+    n, n_y = moments[0].x.shape[-1], groups[0].y.shape[-1]
+    Szz: Any = 0.0
+    Sx1 = S11 = Szz
+    Sxx, Syx = np.zeros((n_y, n, n)), np.zeros((n_y, n))
+    N = 0
+    for (y, v, kinds, kind, _), (x, P, cross, _) in zip(groups, moments, strict=True):
+        G = len(y)
+        z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
+        x1 = x[:, 1:].reshape(-1, n)
+        zz, xz = z.T @ z, x1.T @ z
+        zz[:n, :n] += G * P[:-1].sum(0)
+        xz[:, :n] += G * cross.sum(0)
+        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum(0)
+        for i, seen in enumerate(kinds):
+            xs, ys = x[:, kind == i].reshape(-1, n), y[:, kind == i].reshape(-1, n_y)
+            xx = xs.T @ xs + G * P[kind == i].sum(0)
+            Sxx[seen] += xx
+            Syx[seen] += ys[:, seen].T @ xs
+        N = N + len(x1)
+    AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
+    C = np.stack([np.linalg.solve(_lifted(xx), yx) for xx, yx in zip(Sxx, Syx, strict=True)])
+    RR, M = np.zeros((n_y, n_y)), np.zeros((n_y, n_y))
+    for (y, _, kinds, kind, _), (x, P, *_) in zip(groups, moments, strict=True):
+        e = np.where(np.isnan(y), 0.0, y - x @ C.T)
+        for i, seen in enumerate(kinds):
+            both, rows = np.outer(seen, seen), e[:, kind == i].reshape(-1, n_y)
+            RR += both * (rows.T @ rows + len(y) * C @ P[kind == i].sum(0) @ C.T)
+            M += both * len(rows)
+    Q = _positive((S11 - AB @ Sx1.T) / N, FLOOR_Q)
+    R = _positive(RR / np.maximum(M, 1), FLOOR_R)
+    starts = np.concatenate([m.x[:, 0] for m in moments])
+    every = np.concatenate([m.x.reshape(-1, n) for m in moments])
+    m0, P0 = starting(starts, every, sum(len(m.x) * m.P[0] for m in moments))
+    return Noisy(AB[:, :n], AB[:, n:], C, Q, R, m0, _positive(P0, FLOOR_Q))
+
+
+def _lifted(S: Array) -> Array:
+    return S + 1e-9 * np.trace(S) / len(S) * np.eye(len(S))
+
+
+def _positive(M: Array, floor: float) -> Array:
+    w, v = np.linalg.eigh((M + M.T) / 2)
+    return (v * np.maximum(w, floor)) @ v.T
+
+
+def steady(par: Noisy) -> Innovations:
+    """Return the filter's steady state."""
+    A, B, C, Q, R, m0, P0 = par
+    try:
+        P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    except (ValueError, np.linalg.LinAlgError):  # a mode that nothing excites settles slowly
+        P = Q
+        for _ in range(1000):
+            P = A @ (P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)) @ A.T + Q
+            P = (P + P.T) / 2
+    S = C @ P @ C.T + R
+    L = np.linalg.solve(S, C @ P).T
+    return Innovations(A, B, B[:, :0], np.zeros(len(A)), C, L, S, m0, P0 - P)
+
+
+def starting(first: Array, every: Array, more: Array | float = 0.0) -> tuple[Array, Array]:
+    """Return mean and covariance of the states of a start, and of one more, anywhere in the log.
+
+    ``first`` are the means of states at the starts, ``more`` the sum of their own covariances.
+    """
+    count = len(first) + 1
+    mean = (first.sum(0) + every.mean(0)) / count
+    first, every = first - mean, every - mean
+    return mean, (first.T @ first + more + every.T @ every / len(every)) / count
