@@ -168,3 +168,40 @@ def test_an_environment_of_other_sizes_is_named():
     message = r"the environment: got outputs and actions of sizes \(3, 1\), .*of sizes \(2, 1\)"
     with pytest.raises(QPError, match=message):
         _ = transformed(pendulum(), KalmanFilter(model(4, 2))).observation_spec
+
+
+class Leaky(gymnasium.Env):
+    """A lag whose two sensors answer in some steps only."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.k, self.x = 0, 1.0
+        return self.seen(), {}
+
+    def seen(self) -> np.ndarray:
+        there = np.array([self.k % 3 == 0, self.k % 5 == 0])
+        y = self.x * np.array([1.0, 0.5]) + 0.1 * np.sin([1.7 * self.k, 2.3 * self.k])
+        return np.where(there, y, np.nan)
+
+    def step(self, action):
+        self.k, self.x = self.k + 1, 0.9 * self.x + 0.2 * float(action[0])
+        return self.seen(), 0.0, False, False, {}
+
+
+def test_the_covariance_is_carried_where_outputs_are_often_missing():
+    own = model(3, 2)._replace(S=np.array([[1.0, 0.2], [0.2, 0.5]]))
+    own = own._replace(L=0.2 * own.L, P0=0.5 * np.eye(3))
+    observer = KalmanFilter(own, missing=True, estimate_key="estimate")
+    env = TransformedEnv(GymWrapper(Leaky()), observer)
+    check_env_specs(env, seed=0)
+    data = env.rollout(25, make_policy(3).double())
+    y = torch.cat((data["observation"], data["next", "observation"][-1:])).numpy()
+    assert np.isnan(y).mean() > 0.5
+    expected = own.estimates(y, data["action"].numpy(), y[1:, :0])
+    np.testing.assert_allclose(data["next", "estimate"].numpy(), expected[1:], atol=1e-9)
+    steady = KalmanFilter(own, estimate_key="estimate")
+    other = TransformedEnv(GymWrapper(Leaky()), steady).rollout(25, make_policy(3).double())
+    assert not np.allclose(other["next", "estimate"], expected[1:], atol=1e-2)

@@ -13,6 +13,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.filter import SINGULAR
 from torch_qpmpc.identification.innovations import Innovations
 
 #: The steps of an episode whose gains differ from the last one's, at most.
@@ -24,10 +25,14 @@ class KalmanFilter(Transform):
 
     The estimate before the first output is the model's ``x0``; an output that is NaN corrects
     nothing. The transform has no state: each estimate follows from the last one, the action and the
-    new output. The entry ``filter_step`` counts the steps of an episode, by which the gain varies.
+    new output. The entry ``filter_step`` counts the outputs of an episode, by which the gain varies;
+    if outputs may be ``missing``, ``filter_covariance`` takes its place, from which it follows.
 
     Args:
         model: the model.
+        missing: True if outputs are often NaN, as of slow sensors: the estimates then keep their
+            covariance ``(n, n)``, which `Innovations.P0` begins. Else the gains go on as if no
+            output were missing, which is right for a few.
         observation_key: the key of the output.
         estimate_key: the key of the estimate, by default that of the output, which it replaces.
 
@@ -52,21 +57,45 @@ class KalmanFilter(Transform):
     C: Tensor
     x0: Tensor
     gains: Tensor
+    L: Tensor
+    S: Tensor
+    P0: Tensor
 
     def __init__(
         self,
         model: Innovations,
         *,
+        missing: bool = False,
         observation_key: NestedKey = "observation",
         estimate_key: NestedKey | None = None,
     ) -> None:
         self.observation_key = observation_key
         self.estimate_key = observation_key if estimate_key is None else estimate_key
         super().__init__(in_keys=[observation_key], out_keys=[self.estimate_key])
-        for name in ("A", "B", "E", "offset", "C", "x0"):
+        self.missing = missing
+        self.memory_key = "filter_covariance" if missing else "filter_step"
+        for name in ("A", "B", "E", "offset", "C", "x0", "L", "S", "P0"):
             self.register_buffer(name, torch.as_tensor(getattr(model, name)))
         gains = np.concatenate((model.gains(STEPS), model.L[None]))
         self.register_buffer("gains", torch.as_tensor(gains))
+
+    def gain(self, P: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gains for outputs that are ``seen`` ``(*batch, n_y)`` and the next P.
+
+        P is ``(*batch, n, n)``, as in `Innovations.course`.
+        """
+        C, LS = self.C * seen[..., None], (self.L @ self.S) * seen[..., None, :]
+        S = self.S * seen[..., None] * seen[..., None, :]
+        absent = torch.diag_embed(torch.where(seen, 0.0, self.S.diagonal()))
+        V = C @ P @ C.mT + S + absent
+        size = V.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        unit = torch.where(size > 0, 1 / size, 0.0)
+        unit = unit[..., None] * unit[..., None, :]
+        inverse = unit * torch.linalg.pinv(unit * V, rtol=SINGULAR, hermitian=True)
+        L = self.L * seen[..., None, :]
+        K = L + (P @ C.mT + LS - L @ V) @ inverse  # the steady gain without variance
+        P = self.A @ (P + self.L @ self.S @ self.L.mT - K @ V @ K.mT) @ self.A.mT
+        return K, (P + P.mT) / 2
 
     def first(self, y: Tensor) -> Tensor:
         """Return the estimates ``(*batch, n)`` after the first outputs.
@@ -74,7 +103,7 @@ class KalmanFilter(Transform):
         Args:
             y: ``(*batch, n_y)``.
         """
-        return self._corrected(self.x0.expand(*y.shape[:-1], -1), y, torch.tensor(0))
+        return self._begun(y)[0]
 
     def following(self, x: Tensor, u: Tensor, d: Tensor, y: Tensor, step: Tensor | int) -> Tensor:
         """Return the estimates one step after x, with the applied u, the known d and the new y.
@@ -83,30 +112,45 @@ class KalmanFilter(Transform):
             x, u, d, y: ``(*batch, n)``, ``(*batch, n_u)``, ``(*batch, n_d)`` and ``(*batch, n_y)``.
             step: the number of y's step in its episode, ``(*batch,)`` or ``()``.
         """
-        x, u, d = x.to(self.A), u.to(self.A), d.to(self.A)
-        x = x @ self.A.mT + u @ self.B.mT + d @ self.E.mT + self.offset
-        return self._corrected(x, y, torch.as_tensor(step))
+        return self._corrected(self._predicted(x, u, d), y, torch.as_tensor(step))[0]
 
-    def _corrected(self, x: Tensor, y: Tensor, step: Tensor) -> Tensor:
-        error = y.to(x) - x @ self.C.mT
-        error = torch.where(error.isnan(), 0.0, error).unsqueeze(-1)
-        return x + (self.gains[step.clamp(max=len(self.gains) - 1)] @ error).squeeze(-1)
+    def _predicted(self, x: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        x, u, d = x.to(self.A), u.to(self.A), d.to(self.A)
+        return x @ self.A.mT + u @ self.B.mT + d @ self.E.mT + self.offset
+
+    def _corrected(self, x: Tensor, y: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the estimates after y, and what they follow from next: a step, or P."""
+        seen = ~y.isnan()
+        error = torch.where(seen, y.to(x) - x @ self.C.mT, 0.0).unsqueeze(-1)
+        if memory.is_floating_point():
+            K, after = self.gain(memory, seen)
+        else:
+            K, after = self.gains[memory.clamp(max=len(self.gains) - 1)], memory + 1
+        return x + (K @ error).squeeze(-1), after
+
+    def _begun(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        batch = y.shape[:-1]
+        memory = self.P0 if self.missing else torch.zeros((), dtype=torch.int64, device=y.device)
+        memory = memory.expand(torch.Size([*batch, *memory.shape])).clone()
+        return self._corrected(self.x0.expand(*batch, -1), y, memory)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        y, step = next_tensordict[self.observation_key], tensordict["filter_step"] + 1
+        y, memory = next_tensordict[self.observation_key], tensordict[self.memory_key]
+        memory = memory if self.missing else memory.squeeze(-1)
         x, u, n_d = tensordict[self.estimate_key], tensordict["action"], self.E.shape[-1]
         d = tensordict["preview"][..., :n_d] if n_d else x[..., :0]
-        next_tensordict.set(self.estimate_key, self.following(x, u, d, y, step.squeeze(-1)).to(y))
-        return next_tensordict.set("filter_step", step)
+        return self._kept(next_tensordict, y, *self._corrected(self._predicted(x, u, d), y, memory))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         # At a partial reset, TorchRL keeps the old estimates of the other episodes.
         y = tensordict_reset[self.observation_key]
-        step = torch.zeros((*y.shape[:-1], 1), dtype=torch.int64, device=y.device)
-        tensordict_reset.set(self.estimate_key, self.first(y).to(y))
-        return tensordict_reset.set("filter_step", step)
+        return self._kept(tensordict_reset, y, *self._begun(y))
+
+    def _kept(self, data: TensorDictBase, y: Tensor, x: Tensor, memory: Tensor) -> TensorDictBase:
+        memory = memory if self.missing else memory.unsqueeze(-1)
+        return data.set(self.estimate_key, x.to(y)).set(self.memory_key, memory)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Set the estimate's spec, which is unbounded, and that of the count."""
@@ -138,8 +182,9 @@ class KalmanFilter(Transform):
             got = f"outputs and actions of sizes {got}, {y.dtype}"
             raise QPError.expected("the environment", got, f"real vectors of sizes {want}")
         size = torch.Size([*y.shape[:-1], len(self.A)])
-        count = torch.Size([*y.shape[:-1], 1])
+        memory, dtype = ([len(self.A)] * 2, self.A.dtype) if self.missing else ([1], torch.int64)
+        memory = torch.Size([*y.shape[:-1], *memory])
         return {
             self.estimate_key: Unbounded(size, dtype=y.dtype, device=y.device),
-            "filter_step": Unbounded(count, dtype=torch.int64, device=y.device),
+            self.memory_key: Unbounded(memory, dtype=dtype, device=y.device),
         }

@@ -175,9 +175,11 @@ def steady(par: Noisy) -> Innovations:
 def starting(first: Array, every: Array, more: Array | float = 0.0) -> tuple[Array, Array]:
     """Return mean and covariance of the states of a start, and of one more, anywhere in the log.
 
-    ``first`` are the means of states at the starts, ``more`` the sum of their own covariances.
+    ``first`` are the means of the states at G starts, ``more`` the sum of their own covariances. So
+    the further one weighs 1 / (G + 1): a start elsewhere is as unlikely as the log has many.
     """
-    count = len(first) + 1
-    mean = (first.sum(0) + every.mean(0)) / count
+    one = 1 / (len(first) + 1)
+    count = len(first) + one
+    mean = (first.sum(0) + one * every.mean(0)) / count
     first, every = first - mean, every - mean
-    return mean, (first.T @ first + more + every.T @ every / len(every)) / count
+    return mean, (first.T @ first + more + one * every.T @ every / len(every)) / count
