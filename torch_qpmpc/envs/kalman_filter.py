@@ -25,8 +25,8 @@ class KalmanFilter(Transform):
 
     The estimate before the first output is the model's ``x0``; an output that is NaN corrects
     nothing. The transform has no state: each estimate follows from the last one, the action and the
-    new output. The entry ``filter_step`` counts the outputs of an episode, by which the gain varies;
-    if outputs may be ``missing``, ``filter_covariance`` takes its place, from which it follows.
+    new output. The entry ``filter_step`` counts the outputs of an episode, by which gains vary; if
+    outputs may be ``missing``, gains follow from ``filter_covariance`` in its place.
 
     Args:
         model: the model.
