@@ -25,11 +25,14 @@ from torch_qpmpc.identification.subspace import (
     explained_by_inputs,
     fit_state_space,
     held_out_errors,
+    visited,
     whiteness,
 )
 
 #: Steps of a prediction by default.
 HORIZON = 20
+#: The covariance of a simulation's start, relative to that of the log's states.
+ELSEWHERE = 10.0
 #: An action that the other regressors explain up to this share of its size does not excite.
 STILL = 1e-6
 #: The share of the residuals' variance that the inputs of the same rows may explain.
@@ -90,7 +93,8 @@ class Identified:
 
         Args:
             u: actions ``(T, n_u)``.
-            y: the first outputs, from which the state is estimated, ``(steps, n_y)``.
+            y: the first outputs, from which the state is estimated, ``(steps, n_y)``: it may be
+                anywhere in the log's range, and NaN is missing.
             d: known signals ``(T, n_d)``, if the model has any.
 
         Returns:
@@ -108,7 +112,9 @@ class Identified:
         for name, (value, shape) in sizes.items():
             if value.shape != shape:
                 raise QPError.expected(name, f"shape {value.shape}", f"{shape}")
-        x, outputs = self.model.estimates(y, u[: first - 1], d[: first - 1])[-1], [*y]
+        mean, cov = visited(self.model, self.log.trajectories)
+        model = self.model._replace(x0=mean, P0=ELSEWHERE * cov)
+        x, outputs = model.estimates(y, u[: first - 1], d[: first - 1])[-1], [*y]
         for inputs in self.model.inputs(u, d)[first - 1 :]:
             x = self.model.A @ x + inputs
             outputs.append(self.model.C @ x)
