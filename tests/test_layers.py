@@ -36,7 +36,7 @@ BUDGET = {
     "experiment": 3075,
     "export": 1450,
     "learning": 2900,
-    "identification": 2420,
+    "identification": 2430,
     "mpc": 3385,
     "proofs": 1000,
     "qp": 5560,
