@@ -16,6 +16,7 @@ from torch_qpmpc.control.disturbance import PREFIX, Disturbances, Steady
 from torch_qpmpc.control.scaling import Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.levels import check_used, read_levels
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 REFERENCES = ("held", "preview")
@@ -39,6 +40,9 @@ class Design:
         disturbances: B_w, C_w and names.
         gamma: the discount.
         blocks: numbers of stages that share one input.
+        levels: the levels of inputs that take only these, by name; ``u_bounds`` are within them.
+        switching: the arguments ``min_on``, ``min_off`` and ``start_cost`` by name, and
+            ``integer_horizon`` and ``max_nodes``.
         limits: known signals that bound an output or input from below and above, by its name, ""
             on a side without one.
 
@@ -61,6 +65,8 @@ class Design:
     gamma: float
     blocks: tuple[int, ...] = ()
     limits: dict[str, tuple[str, str]] = field(default_factory=dict)
+    levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    switching: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choice("references", self.references, REFERENCES)
@@ -70,6 +76,7 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
+        object.__setattr__(self, "u_bounds", within_levels(self.u_bounds, self.levels, self.plant))
         prices = np.where(np.isnan(self.y_slack), self.price, self.y_slack)
         object.__setattr__(self, "y_slack", prices)
         if (self.y_slack < 0).any():
@@ -160,6 +167,7 @@ class Design:
         return replace(
             self,
             plant=self.scaling.plant(self.plant),
+            levels={},
             Q=self.Q * np.outer(y, y),
             R=self.R * np.outer(u, u),
             dR=self.dR * np.outer(u, u),
@@ -319,6 +327,46 @@ class Design:
         places = self.places
         unit = np.eye(places["u"].stop)
         return {name: unit[place] for name, place in places.items()}
+
+
+def within_levels(
+    bounds: tuple[Array, Array], levels: Mapping[str, tuple[float, ...]], plant: StateSpace
+) -> tuple[Array, Array]:
+    """Return bounds of the inputs within their levels.
+
+    Raises:
+        QPError: no level of an input is within its bounds.
+    """
+    lower, upper = (side.copy() for side in bounds)
+    for name, own in levels.items():
+        a = plant.inputs.index(name)
+        if not any(lower[a] <= x <= upper[a] for x in own):
+            got = f"[{lower[a]:g}, {upper[a]:g}] of {name}"
+            want = f"bounds with one of its levels {', '.join(f'{x:g}' for x in own)}"
+            raise QPError.expected("u_bounds", got, want)
+        lower[a], upper[a] = max(lower[a], own[0]), min(upper[a], own[-1])
+    return lower, upper
+
+
+def read_switching(
+    u_levels: Any, plant: StateSpace, **others: Any
+) -> tuple[dict[str, tuple[float, ...]], dict[str, Any]]:
+    """Read the levels of inputs, and minimum times and costs of starts, each by name.
+
+    Raises:
+        QPError: a name is no input with levels, or a level is no number.
+    """
+    if not u_levels:
+        check_used("u_levels", others)
+    for name, value in {"u_levels": u_levels, **others}.items():
+        mapping = isinstance(value, Mapping)
+        names = plant.inputs if name == "u_levels" else (u_levels or {})
+        wrong = sorted({*value} - {*names}) if mapping else []
+        if wrong or (name == "u_levels" and not (mapping or value is None)):
+            got, want = repr(wrong[0] if wrong else value), f"a mapping from some of {[*names]}"
+            raise QPError.expected(name, got, want)
+    levels = zip(u_levels or {}, read_levels((u_levels or {}).values()), strict=True)
+    return {name: own for name, own in levels if own}, others
 
 
 def largest(bounds: tuple[Array, Array] | Array) -> Array:

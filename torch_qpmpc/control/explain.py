@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: A multiplier this small, relative to a typical stage's cost for a usual deviation, is rounding.
 ACTIVE = 1e-6
-PLANNED = (Outcome.SOLVED, Outcome.MISSING)
+PLANNED = (Outcome.SOLVED, Outcome.MISSING, Outcome.NODE_LIMIT)
 
 
 class Limit(NamedTuple):
@@ -65,6 +65,11 @@ class Explanation:
             shown = np.unique(np.linspace(0, len(self.u) - 1, 6).astype(int))[1:]
             later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
             lines.append(f"{plant.quantity(name, self.u[0, i])}{', then ' * bool(later)}{later}")
+            on = self.u[:, i] > np.mean(self.design.levels.get(name, (0.0,))[:2])
+            if name in self.design.levels and (on != on[0]).any():
+                lines.append(
+                    f"{name} goes {'off' if on[0] else 'on'} in {(on != on[0]).argmax()} steps"
+                )
         for name, x in self.disturbances.items():
             unit = plant.units.get(name.removeprefix(PREFIX), "")
             lines.append(f"{name} {x:.4g} {unit}".rstrip())
@@ -84,15 +89,15 @@ def explain(law: Law, memory: Memory, status: Outcome, now: Signals, p: Tensor) 
     if status == Outcome.INVALID:  # the last valid signals hold
         known = np.tile(last_known(design, memory), (len(known), 1))
     u, e, rows = np.tile(memory.u, (design.horizon, 1)), memory.e, []
-    plan = law.plans.solve(p.numpy()[None]) if status in PLANNED else None
+    plan = law.plan(p.numpy(), memory) if status in PLANNED else None
     if plan is not None:
-        _, moved = mpc.plan.predicted(torch.from_numpy(plan.z[0]))
+        _, moved = mpc.plan.predicted(torch.from_numpy(plan[0]))
         u += (moved - moved[0]).numpy()
     for k in range(len(u)):
         rows.append(np.full(len(design.Q), np.nan) if e is None else law.observer.H @ e)
         e = e if e is None else law.observer.predicted(e, u[min(k + 1, len(u) - 1)], known[k + 1])
     y = np.array(rows)
-    limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
+    limits = () if plan is None else _limits(design, plan[1], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
     finding = set_points(Setting(mpc, w, known[0]), memory.r, False)

@@ -25,8 +25,12 @@ from torch_qpmpc.control.observer import (
 )
 from torch_qpmpc.control.state_space import Array, read_table, read_vector
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.levels import Searches
 from torch_qpmpc.qp.pipeline.solve import AtRest
 from torch_qpmpc.qp.program import Status
+
+#: A number of steps that exceeds each minimum time.
+LONG = 2**30
 
 
 class Memory(NamedTuple):
@@ -38,6 +42,8 @@ class Memory(NamedTuple):
         steps: the place of the next gain among `Observer.gains`, the last one from rest.
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
+        runs: for how many steps each input was on (above its lowest level), or with a minus off.
+        ahead: the levels that the last plan has from the next step on, None without any.
         rest: the outputs and the input at rest that the last reset was passed, or None for each.
         P: the observer's P for the next step after a missing output, None while it is steady.
     """
@@ -49,6 +55,8 @@ class Memory(NamedTuple):
     rest: tuple[Array | None, Array | None] = (None, None)
     steps: int = 0
     P: Array | None = None
+    runs: Array | None = None
+    ahead: Array | None = None
 
 
 class Signals(NamedTuple):
@@ -63,7 +71,7 @@ class Signals(NamedTuple):
 
 
 class Outcome(IntEnum):
-    """What a step has come to: ``SOLVED, LIMIT, INFEASIBLE, INVALID`` or ``MISSING``.
+    """What a step has come to, which `explanation` says in words.
 
     Functions in C return the same numbers. A valid signal is finite and not above
     `Law.max_plausible`. An input that stays is clipped into its bounds.
@@ -74,6 +82,7 @@ class Outcome(IntEnum):
     INFEASIBLE = 2
     INVALID = 3
     MISSING = 4
+    NODE_LIMIT = 5
 
     def __str__(self) -> str:
         return self.name
@@ -87,6 +96,7 @@ class Outcome(IntEnum):
             "No plan keeps the hard bounds: the last input stays.",
             "A set-point, known signal or first output is invalid: the last input stays.",
             "Predictions stand for missing outputs, and the input is optimal for them.",
+            "The best plan on levels that the search found; a better one may exist.",
         )[self]
 
 
@@ -178,7 +188,8 @@ class Law:
         last = np.zeros(len(self.design.plant.inputs)) if u is None else u
         last = np.clip(last, *self.design.u_bounds)
         steps = len(self.observer.gains) - 1 if rests else 0
-        return Memory(last, rest=(None, None if u is None else last), steps=steps)
+        runs = np.where(last > self._switches, LONG, -LONG)
+        return Memory(last, rest=(None, None if u is None else last), steps=steps, runs=runs)
 
     def estimates(self, memory: Memory) -> tuple[Array, Array]:
         """Return the predictions of x and w, zero before the first step."""
@@ -203,17 +214,72 @@ class Law:
             aimed.append(steady)
         steady = [*map(np.stack, zip(*aimed, strict=True))] if previewed else aimed[0]
         p = design.arranged(np, e[:n], steady, memory.u, known, level)
-        plan = self.plans.solve(p[None])
-        if plan.status[0]:
-            proved = plan.status[0] == Status.INFEASIBLE
+        z, found, ahead = self._planned(p, memory)
+        if found not in (Status.SOLVED, Status.NODE_LIMIT):
+            proved = found == Status.INFEASIBLE
             return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
-        u = self._within(aimed[-1][1] + plan.z[0, qp.n_p : qp.n_p + qp.n_u], memory)
+        status = Outcome.NODE_LIMIT if found == Status.NODE_LIMIT else status
+        u = self._within(aimed[-1][1] + z[qp.n_p : qp.n_p + qp.n_u], memory)
+        u, memory = self._on_level(u), memory._replace(ahead=ahead)
         target = Target(*map(torch.from_numpy, steady))
         return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p))
 
+    @cached_property
+    def searches(self) -> Searches | None:
+        """The searches for plans on levels, with the theta of their first use; None without."""
+        plan = self.mpc.plan
+        if plan.levels is None:
+            return None
+        with torch.no_grad():
+            qp = plan.quadratic_program()
+        return Searches(plan.levels, qp, plan.n_p + plan.n_u, plan.solver)
+
+    def _planned(self, p: Array, memory: Memory) -> tuple[Array, Status, Array | None]:
+        """Return the plan's z, its status, and the levels that it has from the next step on."""
+        levels = self.mpc.plan.levels
+        if self.searches is None or levels is None:
+            plan = self.plans.solve(p[None])
+            return plan.z[0], Status(int(plan.status[0])), None
+        assert memory.runs is not None
+        plan, places = self.searches.solve(p[None], memory.runs[levels.actions], memory.ahead)
+        return plan.z[0], Status(int(plan.status[0])), np.append(places[:, 1:], places[:, -1:], 1)
+
+    def plan(self, p: Array, memory: Memory) -> tuple[Array, Array]:
+        """Return z and the rows' multipliers of the plan with p, from the memory after its step.
+
+        Those of decisions on levels are zero.
+        """
+        levels = self.mpc.plan.levels
+        if self.searches is None or levels is None:
+            plan = self.plans.solve(p[None])
+            return plan.z[0], plan.lam[0]
+        assert memory.ahead is not None
+        off = np.abs(memory.u[levels.actions, None] - levels.values)
+        off[np.arange(off.shape[1]) >= levels.counts[:, None]] = np.inf
+        places = np.column_stack((off.argmin(1), memory.ahead[:, :-1]))
+        plan = self.searches.held(p[None], places)
+        plan.lam[0, levels.rows] = 0.0
+        return plan.z[0], plan.lam[0]
+
+    @cached_property
+    def _switches(self) -> Array:
+        """What each input exceeds if it is on: the middle of its lowest levels, ``(m,)``."""
+        levels = (self.design.levels.get(name, ()) for name in self.design.plant.inputs)
+        return np.array([np.mean(own[:2]) if own else np.inf for own in levels])
+
+    def _on_level(self, u: Array) -> Array:
+        """Return inputs at their nearest levels within their bounds."""
+        u = u.copy()
+        for name, own in self.design.levels.items():
+            a = self.design.plant.inputs.index(name)
+            lower, upper = (side[a] for side in self.design.u_bounds)
+            u[a] = min((x for x in own if lower <= x <= upper), key=lambda x: abs(x - u[a]))
+        return u
+
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
-        u = self._within(memory.u, memory)
+        u = self._on_level(self._within(memory.u, memory))
+        memory = memory._replace(ahead=None)
         return Move(u, self._after(memory, e, u), status)
 
     def _aimed(self, r: Array, w: Array, level: Array) -> list[Array] | None:
@@ -278,7 +344,10 @@ class Law:
         if e is not None:
             assert memory.known is not None
             e = self.observer.predicted(e, u, memory.known)
-        return memory._replace(u=self._within(u, memory), e=e)
+        on, runs = u > self._switches, np.zeros(len(u)) if memory.runs is None else memory.runs
+        runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
+        runs = np.clip(runs, -LONG, LONG).astype(np.int64)
+        return memory._replace(u=self._within(u, memory), e=e, runs=runs)
 
     def _within(self, u: Array, memory: Memory) -> Array:
         """Return inputs within their bounds, as known signals have them now."""

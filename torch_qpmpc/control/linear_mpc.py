@@ -20,8 +20,10 @@ from torch_qpmpc.control.design import (
     read_moves,
     read_prices,
     read_slack,
+    read_switching,
     read_weight,
     signals_of,
+    within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import free_mpc, lowered, target_mpc
@@ -83,6 +85,14 @@ class LinearMPC:
         blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
             ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves then hold between blocks.
         gamma: the discount.
+        u_levels: the levels of inputs that take no other values, ``{"q": (0.0, 4.0, 8.0)}``; the
+            lowest is *off*.
+        min_on, min_off: the fewest steps that such an input stays on, at any level but the lowest,
+            and off, by name or for all.
+        start_cost: the cost of going on from off, likewise.
+        integer_horizon: the number of stages that are decided on levels, N by default; later ones
+            are relaxed to the numbers between.
+        max_nodes: the most QPs that a search for the best plan on levels solves.
         options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of the plan's
             `QPMPC`; by default a tied structure that learns nothing, and DAQP.
 
@@ -123,6 +133,12 @@ class LinearMPC:
         disturbances: Any = "auto",
         blocks: Sequence[int] = (),
         gamma: float = 1.0,
+        u_levels: Mapping[str, Sequence[float]] | None = None,
+        min_on: Any = 1,
+        min_off: Any = 1,
+        start_cost: Any = 0.0,
+        integer_horizon: int | None = None,
+        max_nodes: int = 10_000,
         E: Any = None,
         dt: float | None = None,
         inputs: Sequence[str] | None = None,
@@ -138,6 +154,12 @@ class LinearMPC:
         weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         wishes = read_wishes(plant, None, **weights, **bounds)
+        rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
+        levels, switching = read_switching(
+            u_levels, plant, **rules, integer_horizon=integer_horizon
+        )
+        switching["max_nodes"] = max_nodes
+        wishes["u_bounds"] = within_levels(wishes["u_bounds"], levels, plant)
         limits = wishes["y_bounds"], wishes["u_bounds"], wishes["Q"]
         scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
@@ -149,6 +171,8 @@ class LinearMPC:
             disturbances=choose(plant, disturbances, scaling),
             gamma=gamma,
             blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
+            levels=levels,
+            switching=switching,
         )
         self._start(design, options)
 

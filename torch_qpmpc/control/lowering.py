@@ -16,6 +16,7 @@ their digits; it remains where f moves an output with soft bounds.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import combinations
 from typing import Any
 
@@ -172,7 +173,22 @@ def _bounds(design: Design) -> Bounds:
         constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
         discount_slack=True,
         held=held if len(D) else None,
+        **_levels(design, n_y),
     )
+
+
+def _levels(design: Design, n_y: int) -> dict[str, Any]:
+    """Return the arguments of `Bounds` for inputs on levels, whose rows follow ``n_y`` others."""
+    if not design.levels:
+        return {}
+    names, switching = design.plant.inputs, dict(design.switching)
+    rows = np.cumsum(np.isfinite(design.u_bounds).any(0)) - 1 + n_y
+    defaults = {"min_on": 1, "min_off": 1, "start_cost": 0.0}
+    for name, default in defaults.items():
+        if isinstance(own := switching[name], Mapping):
+            switching[name] = [own.get(x, default) for x in names]
+    levels = [design.levels.get(name) for name in names]
+    return {"action_levels": levels, "level_rows": rows.tolist(), **switching}
 
 
 def is_split(design: Design) -> bool:

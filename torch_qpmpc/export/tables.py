@@ -18,7 +18,7 @@ import torch
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import check_one_model
+from torch_qpmpc.mpc.validation import check_no_levels, check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
 from torch_qpmpc.qp.pipeline.scaling import ROUNDING, lengths
 from torch_qpmpc.qp.program import EVENT_SHAPES, INFINITE, QuadraticProgram, Status, crossed
@@ -111,6 +111,7 @@ def make_tables(mpc: QPMPC) -> Tables:
             the plan.
     """
     check_one_model(mpc)
+    check_no_levels(mpc, "C code")
     qp = mpc.quadratic_program()
     H, q, c, C, b, G, lb, ub, w = (x.detach().double().cpu().numpy() for x in qp.tensors())
     _check(qp)

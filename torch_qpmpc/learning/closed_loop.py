@@ -31,6 +31,7 @@ from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parametrizations import Tied
 from torch_qpmpc.mpc.scheme import Scheme
+from torch_qpmpc.mpc.validation import check_no_levels
 
 #: The steps of a loop whose gains differ from the last one's, at most.
 STEPS = 1000
@@ -442,6 +443,7 @@ def improve(
         (True, True)
     """
     check_kind("mpc", mpc, QPMPC)
+    check_no_levels(mpc, "gradients of closed loops")
     sizes = {"updates": updates, "loops": loops, "steps": steps, "members": members}
     for name, size in sizes.items():
         check_whole(name, size, 1)

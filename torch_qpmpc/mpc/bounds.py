@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_flag
+from torch_qpmpc.checks import check_flag, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.levels import read_levels
 from torch_qpmpc.mpc.parametrizations import LinearRows
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
@@ -37,6 +38,15 @@ class Bounds:
             actions, and of mixed and terminal constraints; ``inf`` makes them hard. By default,
             actions are hard and the others soft. Pass one weight, or one per entry; for
             ``constraint_slack`` one per row of D, then of D^f.
+        action_levels: for each action its levels, ascending, of which the lowest is *off*, or None
+            for an action between its bounds. Levels outside action_bounds are not taken.
+        min_on, min_off: the fewest steps that an action with levels stays on, at any level but the
+            lowest, and off; one number, or one for each action.
+        start_cost: the cost of going on from off, likewise, discounted by gamma^k.
+        integer_horizon: the number of stages that are decided on levels, all by default; actions of
+            later ones are between the lowest and the highest level.
+        max_nodes: the most QPs that the search for a plan on levels solves.
+        level_rows: for each action the row of D whose value is on the levels; its own by default.
         discount_slack: discount w by gamma^k, as the MPC form does (eq:v1c0), or not (eq:qp2c0).
         held: one bool per row of D: True where a row that holds in a block's first stage holds in
             the others. By default those of actions alone.
@@ -62,6 +72,13 @@ class Bounds:
     constraint_slack: Any = 100.0
     discount_slack: bool = False
     held: Any = None
+    action_levels: Any = None
+    min_on: Any = 1
+    min_off: Any = 1
+    start_cost: Any = 0.0
+    integer_horizon: int | None = None
+    max_nodes: int = 10_000
+    level_rows: Any = None
 
     def __post_init__(self) -> None:
         check_flag("discount_slack", self.discount_slack)
@@ -77,6 +94,11 @@ class Bounds:
                 want = f"({n_mixed},): one entry per row of constraints"
                 raise QPError.expected("held", f"shape {tuple(held.shape)}", want)
             object.__setattr__(self, "held", held)
+        check_whole("max_nodes", self.max_nodes, 1)
+        if self.integer_horizon is not None:
+            check_whole("integer_horizon", self.integer_horizon, 1)
+        if self.action_levels is not None:
+            object.__setattr__(self, "action_levels", read_levels(self.action_levels))
 
     def counted(self, layout: Layout) -> Layout:
         """Return ``layout`` with the numbers of these rows."""
@@ -95,6 +117,8 @@ class Bounds:
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
         x = _matching_pair("state_bounds", self.state_bounds, n_x)
         u = _matching_pair("action_bounds", self.action_bounds, n_u)
+        if self.action_levels is not None and self.level_rows is None:
+            u = _hull(u, self.action_levels)
         lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
         n_linear = layout.n_mixed + layout.n_terminal
         price = _matching_slack("constraint_slack", self.constraint_slack, n_linear)
@@ -136,6 +160,20 @@ def _side(name: str, values: Any, side: int) -> Tensor:
         want = ("lower bounds below inf", "upper bounds above -inf")[side]
         raise QPError.expected(name, f"{values.tolist()}", want)
     return values.detach().clone()
+
+
+def _hull(
+    bounds: tuple[Tensor, Tensor], levels: Sequence[Sequence[float]]
+) -> tuple[Tensor, Tensor]:
+    """Return bounds within the lowest and the highest level of actions on levels."""
+    lower, upper = (side.clone() for side in bounds)
+    for a, own in enumerate(levels):
+        if own and a < len(lower):
+            if not any(lower[a] <= x <= upper[a] for x in own):
+                got, want = f"levels {[*own]}", f"one within [{lower[a]:g}, {upper[a]:g}]"
+                raise QPError.expected("action_levels", got, want, "Widen action_bounds.")
+            lower[a], upper[a] = max(lower[a], own[0]), min(upper[a], own[-1])
+    return lower, upper
 
 
 def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -25,6 +25,7 @@ from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
@@ -37,6 +38,7 @@ from torch_qpmpc.mpc.validation import (
     STRUCTURES,
     as_tensor,
     check_learn,
+    check_no_levels,
     check_one_model,
     check_pair,
     learned_entries,
@@ -92,6 +94,8 @@ class QPMPC(nn.Module):
     Attributes:
         scheme: the `Scheme` that theta starts from.
         layout: its `Layout`.
+        levels: the `Levels` of its actions; None without any. V is then the minimum over plans on
+            levels, and its gradient that of the best plan's QP.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
         schedule: the `BlendedModel`, a copy of the one passed; None without one.
         n_p: the number of entries of p, (N + 1) n_d + n_x.
@@ -155,6 +159,7 @@ class QPMPC(nn.Module):
         self.scheme, self.layout, self._random = scheme, scheme.layout, scheme.is_random
         self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
         self.n_d, self.gamma = self.layout.n_d, scheme.gamma
+        self.levels = Levels.of(scheme)
         self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
@@ -664,11 +669,15 @@ class QPMPC(nn.Module):
         fixed = to_dtype(fixed, qp.C.dtype)
         if self.schedule is not None:
             qp = self._scheduled(qp, fixed[..., : self.n_p])
-        return solve(qp, fixed, n_kept, self.solver, on_failure or self.on_failure, warm_start)
+        on_failure = on_failure or self.on_failure
+        if self.levels is not None:
+            return self.levels.solve(qp, fixed, n_kept, self.solver, on_failure)
+        return solve(qp, fixed, n_kept, self.solver, on_failure, warm_start)
 
     @torch.no_grad()
     def at_rest(self) -> AtRest:
         """Return what solves V's QPs with today's theta, without the schedule, one by one."""
+        check_no_levels(self, "solves at rest")
         return AtRest(self.quadratic_program(), self.n_p, self.n_p + self.n_u, self.solver)
 
     def _action_at_rest(self, x: np.ndarray, warm: bool) -> np.ndarray | None:
@@ -677,7 +686,7 @@ class QPMPC(nn.Module):
         From none, it does not depend on earlier calls, so that a resumed run repeats it. The
         preparation is kept until theta changes; it is None, too, if that cannot be seen.
         """
-        if self._random or self.schedule is not None:
+        if self._random or self.schedule is not None or self.levels is not None:
             return None
         leaves, at_rest = vars(self).get("_at_rest", (None, None))
         if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:

@@ -43,6 +43,7 @@ def identity(mpc: Any) -> dict[str, Any]:
         "discount_slack": mpc.scheme.bounds.discount_slack,
         "learn": {x: digest(mpc._masks[x]) if x in mpc._masks else True for x in mpc.learned},
         "hard rows": digest(mpc.scheme.theta["w"].isinf()),
+        "action_levels": mpc.levels and repr(mpc.levels.identity),
         "centres": None if mpc.schedule is None else len(mpc.schedule.centres),
     }
 

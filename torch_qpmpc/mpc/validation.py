@@ -72,6 +72,14 @@ def check_one_model(mpc: Any) -> None:
         raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
 
 
+def check_no_levels(mpc: Any, what: str) -> None:
+    """Raise `QPError` if actions of a QPMPC take levels, for ``what`` needs one QP."""
+    if mpc.levels is not None:
+        got, want = "one with action_levels", f"one without, for {what}"
+        remedy = "A scheme with action_levels=None has the relaxed plan."
+        raise QPError.expected("mpc", got, want, remedy)
+
+
 def as_tensor(name: str, value: Any) -> Tensor:
     """Convert by `read_numbers`; raise `QPError` unless all entries are finite."""
     tensor = read_numbers(name, value)

@@ -14,6 +14,7 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import check_no_levels
 from torch_qpmpc.proofs.encoding import encode
 from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants
 from torch_qpmpc.proofs.program import Affine, Array, Program
@@ -174,6 +175,7 @@ def largest_difference(
 def check_states(mpc: QPMPC, states: Polytope) -> int:
     """Return n_p; raise unless the states have that many entries."""
     check_kind("mpc", mpc, QPMPC)
+    check_no_levels(mpc, "proofs")
     check_kind("states", states, Polytope, "Make one with Polytope.box(lower, upper).")
     if len(states.lower) != mpc.n_p:
         got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"

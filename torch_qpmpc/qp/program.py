@@ -45,10 +45,11 @@ NDIMS = tuple(len(event) for event in EVENT_SHAPES.values())
 
 
 class Status(IntEnum):
-    """Outcome of one QP of a batch; only ``SOLVED`` has a solution.
+    """Outcome of one QP of a batch; only ``SOLVED`` and ``NODE_LIMIT`` have a solution.
 
     ``INFEASIBLE`` and ``UNBOUNDED`` are proved, ``NOT_CONVERGED`` is neither proved nor solved, and
-    ``INVALID_DATA`` has NaN, crossing bounds or a cost that is not convex.
+    ``INVALID_DATA`` has NaN, crossing bounds or a cost that is not convex. ``NODE_LIMIT`` is
+    the best plan on levels that a search of `Bounds.max_nodes` found.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -61,6 +62,7 @@ class Status(IntEnum):
     UNBOUNDED = 2
     NOT_CONVERGED = 3
     INVALID_DATA = 4
+    NODE_LIMIT = 5
 
     @property
     def explanation(self) -> str:
@@ -77,6 +79,8 @@ _EXPLANATIONS = {
     "provably infeasible nor unbounded; it may be ill-conditioned, like the predictions of an "
     "unstable model over a long horizon: shorten the horizon, give the model a stabilising "
     "feedback u = K x + v, or rescale the QP",
+    Status.NODE_LIMIT: "the plan keeps levels and minimum times, and a better one may exist: the "
+    "search ended at its number of nodes; pass a shorter integer_horizon, or more max_nodes",
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
     "semidefinite; check the parameters and the state",
 }

@@ -129,6 +129,33 @@ class Prepared:
         """Return the `Sizes` of the reduced QPs."""
         return self.once(("sizes", n_f), lambda: sizes(self.condensed(n_f), self.theta, n_f))
 
+    def dual(self, n_f: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return K = G H^-1 G' with a unit diagonal, its units, and the map of -g to the rows.
+
+        They are ``(M, r, r)``, ``(M, r)`` and ``(M, r, d)``; a singular H is shifted, see `Sizes`.
+        """
+
+        def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            inverse = self.sizes(n_f).inverse
+            R = self.reduced(n_f).G @ inverse.swapaxes(1, 2)
+            unit = np.linalg.norm(R, axis=-1)
+            R = R / unit[:, :, None]
+            return R @ R.swapaxes(1, 2), unit, R @ inverse
+
+        return self.once(("dual", n_f), make)
+
+    def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
+        """Return the same theta with other bounds of the rows that have some, in the same units."""
+        theta = self.theta._replace(lb=lb, ub=ub)
+        other = Prepared(theta, self.group, self.n_kept, self._elimination)
+        same = ("condensed", "convex", "sensitivities", "sizes")
+        other._known = {name: x for name, x in self._known.items() if name[0] in same}
+        vars(other)["units"] = self.units
+        if self.units is not None:
+            rows = per_qp(self.units.rows, self.group)
+            vars(other)["scaled"] = self.scaled.bounded(lb / rows, ub / rows)
+        return other
+
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
         used, group = np.unique(group, return_inverse=True)

@@ -137,7 +137,7 @@ def solve_now(*arguments: Any) -> BatchSolution:
         remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
         raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
     if on_failure != "mask" and solution.status.any():
-        _report(solution, batch, on_failure)
+        report(solution.status, batch, on_failure)
 
     outputs = solution.in_torch()
     if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs.value.device:
@@ -150,8 +150,9 @@ def solve_now(*arguments: Any) -> BatchSolution:
     return BatchSolution._make(map(out, outputs))
 
 
-def _report(solution: BatchSolution, batch: torch.Size, on_failure: str) -> None:
-    statuses = torch.as_tensor(solution.status)
+def report(status: np.ndarray, batch: torch.Size, on_failure: str) -> None:
+    """Raise or warn about the unsolved QPs of a batch, by their `Status` ``(B,)``."""
+    statuses = torch.as_tensor(status)
     failed = statuses.nonzero().squeeze(-1)
     reasons = []
     for status in Status:

@@ -1,0 +1,120 @@
+"""Inputs on levels: minimum times over what was applied, limits, files and errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import torch_qpmpc as qm
+
+LEVELS = (0.0, 4.0, 8.0)
+
+
+def of(**options) -> qm.LinearMPC:
+    """Return the MPC of a room with a heat pump that has two speeds and a load."""
+    defaults = {
+        "Q": {"T": 1.0},
+        "u_levels": {"q": LEVELS},
+        "min_on": {"q": 3},
+        "min_off": {"q": 2},
+        "start_cost": {"q": 0.5},
+        "integer_horizon": 5,
+        "inputs": ["q"],
+        "outputs": ["T"],
+    }
+    return qm.LinearMPC(([[0.9]], [[0.1]]), 8, **{**defaults, **options})
+
+
+def runs_of(u: np.ndarray) -> list[tuple[bool, int]]:
+    """Return the runs of on and off, without the first and the last one."""
+    on, ends = u > 2, np.flatnonzero(np.diff(u > 2)) + 1
+    parts = np.split(on, ends)
+    return [(bool(part[0]), len(part)) for part in parts[1:-1]]
+
+
+def closed_loop(controller: qm.Controller, steps: int, manual=()) -> np.ndarray:
+    rng, T, applied = np.random.default_rng(0), 0.0, []
+    for k in range(steps):
+        y = [np.nan if rng.random() < 0.1 and k else T]
+        r = [2.0 + 2.0 * (k // 20 % 2)]
+        if k in manual:
+            u = np.array([8.0])
+            controller.observe(y, u)
+        else:
+            u = controller.step(y, r=r)
+            assert controller.status in (0, 4)
+        applied.append(u[0])
+        T = 0.9 * T + 0.1 * u[0] + 0.05 * rng.normal()
+    return np.array(applied)
+
+
+def test_minimum_times_count_what_was_applied_with_missing_outputs_and_manual_mode():
+    u = closed_loop(qm.Controller(of()), 60)
+    assert set(u) <= {*LEVELS}
+    assert len(runs_of(u)) > 4
+    assert all(length >= (3 if on else 2) for on, length in runs_of(u))
+    controller = qm.Controller(of())
+    controller.reset(y=[0.0], u=[0.0])
+    controller.observe([0.0], [8.0])  # goes on, by hand
+    u = [controller.step([9.0], r=[0.0])[0] for _ in range(4)]  # too warm from now on
+    assert min(u[:2]) > 0  # on for three steps
+    assert u[2] == u[3] == 0
+
+
+def test_explain_names_the_next_switch():
+    controller = qm.Controller(of(Q={"T": 0.1}))
+    controller.reset(y=[0.0], u=[0.0])
+    controller.step([0.0], r=[2.2])
+    explanation = controller.explain()
+    assert set(explanation.u[:5, 0].round(9)) <= {*LEVELS}
+    on = explanation.u[:, 0] > 2
+    assert f"q goes {'off' if on[0] else 'on'} in {(on != on[0]).argmax()} steps" in str(
+        explanation
+    )
+    assert not [limit for limit in explanation.limits if limit.signal == "q"]
+
+
+def test_a_file_goes_on_in_the_middle_of_a_minimum_time(tmp_path):
+    controller = qm.Controller(of())
+    closed_loop(controller, 13)
+    controller.save(tmp_path / "c")
+    twin = qm.Controller.load(tmp_path / "c")
+    y = [[x] for x in (1.0, 3.0, 5.0, 0.0, 1.0)]
+    assert [controller.step(x)[0] for x in y] == [twin.step(x)[0] for x in y]
+
+
+def test_redesign_keeps_levels_within_new_bounds_and_refuses_bounds_without_any():
+    controller = qm.Controller(of(min_on=1, min_off=1))
+    controller.step([0.0], r=[6.0])
+    controller.redesign(u_bounds={"q": (0.0, 5.0)})
+    assert {controller.step([0.0], r=[6.0])[0] for _ in range(3)} == {4.0}
+    with pytest.raises(qm.QPError, match=r"u_bounds: got \[1, 3\] of q, expected bounds with one"):
+        controller.redesign(u_bounds={"q": (1.0, 3.0)})
+
+
+def test_without_a_plan_the_input_stays_on_a_level():
+    controller = qm.Controller(of())
+    controller.reset(y=[1.0], u=[2.7])
+    assert controller.step([1.0], r=[np.nan])[0] == 4.0
+    assert controller.status.name == "INVALID"
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"u_levels": {"p": LEVELS}}, "u_levels: got 'p', expected a mapping from some of"),
+        ({"u_levels": LEVELS}, "u_levels: got .* expected a mapping"),
+        ({"min_on": {"T": 2}}, "min_on: got 'T', expected a mapping from some of"),
+        ({"u_bounds": {"q": (1.0, 2.0)}}, "u_bounds: got .1, 2. of q"),
+        ({"u_levels": None}, "min_on: got {'q': 3}, expected u_levels"),
+        ({"blocks": [2, 6]}, "blocks: .* expected no blocks"),
+    ],
+)
+def test_wrong_levels_are_errors(options, match):
+    with pytest.raises(qm.QPError, match=match):
+        of(**options)
+
+
+def test_c_code_of_levels_is_refused(tmp_path):
+    with pytest.raises(qm.QPError, match=r"mpc: got one with action_levels, .* for C code"):
+        qm.Controller(of()).export_c(tmp_path)
