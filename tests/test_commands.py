@@ -37,7 +37,7 @@ STOPPED = (
     "python train.py {run} & while [ ! -e {folder}/checkpoint.pt ]; do sleep 0.2; done; kill $!; "
     "wait $! && exit 1; "
 )
-LONG = " ".join(SMALL) + " seed=71 updates=200 hydra.run.dir={folder}"
+LONG = " ".join(SMALL) + " seed=71 updates=200 eval_interval=10 hydra.run.dir={folder}"
 PENDULUM = "python train.py task=gymnasium task.id=Pendulum-v1 start=data"
 SCRIPT = "import runpy; print(runpy.run_path('docs/examples/torchrl/ddpg.py')['main'](2, seed=71))"
 
@@ -58,6 +58,9 @@ class Short(NamedTuple):
 
 #: Why a command does not run in these tests.
 CANNOT = {
+    "python docs/examples/fmu_plant.py room.fmu --inputs heat --outputs T --dt 900": "it reads an "
+    "FMU of one's own",
+    "python -m tests.benchmarks.toolboxes": "it compares packages that are not installed",
     "python3 -m venv .venv": "it makes an environment; .ci/run does, too",
     "python -m tests.benchmarks.table": "a benchmark of minutes that cannot be shortened",
     "python -m tests.benchmarks.one_state --write": "the same, with osqp, clarabel and casadi",
@@ -224,7 +227,7 @@ def test_a_command_of_one_run_ends(command, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", [page for page, of in DOCUMENTED.items() if of])
 def test_the_commands_of_a_page_end(page, tmp_path, capsys):
     """One after the other, as a reader would run them, in a copy of the repository."""
-    skip = shutil.ignore_patterns(".*", "venv", "runs", "site", "__pycache__")
+    skip = shutil.ignore_patterns(".*", "venv", "runs", "site")
     clone = Path(shutil.copytree(ROOT, tmp_path / "clone", ignore=skip))
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(clone), "OMP_NUM_THREADS": "1"}
