@@ -154,6 +154,20 @@ def test_relaxed_stages_and_continuous_actions_cost_less_and_keep_the_levels_of_
     assert kept.predicted(kept.solve(s).z)[1].min() > -1e-9
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_prices_without_curvature_equal_enumeration(seed):
+    rng, q = np.random.default_rng(seed), torch.zeros(3 * N + 2, dtype=torch.float64)
+    q[2::3] = torch.from_numpy(rng.uniform(0.05, 0.4, N))
+    mpc = qm.QPMPC.from_model(
+        [[0.8, 0.1], [0.02, 0.97]], [[0.0], [0.06]], N, q=q, gamma=1.0, solver="daqp",
+        stage_weight=np.zeros(3), terminal_weight=np.zeros(2), action_levels=[(0.0, 6.0)],
+        state_bounds=([1.0, -9.0], [1.5, 9.0]), state_slack=3.0,
+        min_on=[3], min_off=[2], start_cost=[0.2],
+    )  # fmt: skip
+    s = torch.from_numpy(rng.uniform(0.9, 1.5, 2))
+    assert mpc.value(s).item() == pytest.approx(enumerated(mpc, s)[0], rel=1e-6)
+
+
 def test_a_search_that_ends_early_says_so_with_its_gap():
     mpc = qm.QPMPC.from_model(
         [[0.9, 0.1], [0.0, 0.8]], [[0.05], [0.2]], 16, stage_weight=[1.0, 0.1, 0.02],

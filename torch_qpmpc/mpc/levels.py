@@ -30,6 +30,8 @@ from torch_qpmpc.qp.tracing import is_eager
 
 #: An action is on a level within this fraction of the levels' distance.
 ON_LEVEL = 1e-6
+#: The curvature of a search where H has none, relative to the cost's slope and the levels.
+CURVATURE = 1e-7
 #: The statuses of the search's outcomes.
 STATUSES = np.array([Status.SOLVED, Status.NODE_LIMIT, Status.INFEASIBLE, Status.NOT_CONVERGED])
 #: What has no use without levels.
@@ -207,8 +209,12 @@ class Levels:
             programs.theta,
             programs.group,
         )
-        (K, unit, to_free), of = prepared.dual(n_f), prepared.reduced(n_f).rows
-        qps, scale = programs.reduced_qps(), unit[group]
+        qps, of, least = programs.reduced_qps(), prepared.reduced(n_f).rows, 0.0
+        if prepared.sizes(n_f).shift.any() and (slope := np.abs(qps.g).max(initial=0.0)) > 0:
+            # A power of two, as each is kept.
+            least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / np.abs(self.values).max()))
+        K, unit, to_free = prepared.dual(n_f, float(least))
+        scale = unit[group]
         lb, ub = theta.lb[:, of], theta.ub[:, of]
         with np.errstate(invalid="ignore"):
             shift = np.where(

@@ -36,6 +36,7 @@ from torch_qpmpc.qp.pipeline.condensing import (
     Sizes,
     condense,
     convex,
+    inverse_factors,
     reduce,
     sensitivities,
     sizes,
@@ -129,20 +130,21 @@ class Prepared:
         """Return the `Sizes` of the reduced QPs."""
         return self.once(("sizes", n_f), lambda: sizes(self.condensed(n_f), self.theta, n_f))
 
-    def dual(self, n_f: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def dual(self, n_f: int, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return K = G H^-1 G' with a unit diagonal, its units, and the map of -g to the rows.
 
-        They are ``(M, r, r)``, ``(M, r)`` and ``(M, r, d)``; a singular H is shifted, see `Sizes`.
+        They are ``(M, r, r)``, ``(M, r)`` and ``(M, r, d)``. ``least`` is added to H's diagonal.
         """
 
         def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            inverse = self.sizes(n_f).inverse
-            R = self.reduced(n_f).G @ inverse.swapaxes(1, 2)
+            _, _, H, G, *_ = self.reduced(n_f)
+            inverse, _ = inverse_factors(H + least * np.eye(H.shape[-1]))
+            R = G @ inverse.swapaxes(1, 2)
             unit = np.linalg.norm(R, axis=-1)
             R = R / unit[:, :, None]
             return R @ R.swapaxes(1, 2), unit, R @ inverse
 
-        return self.once(("dual", n_f), make)
+        return self.once(("dual", n_f, least), make)
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""
