@@ -66,13 +66,15 @@ def test_a_dropout_is_predicted_through_alike_in_c(bad):
 
 @pytest.mark.parametrize("bad", [None, *BAD])
 def test_the_other_outputs_correct_the_estimates_while_one_is_missing(bad):
-    controller, twin = exported(two_by_two)
-    before, gain = np.zeros(4), controller.observer.L
+    controller, twin = exported(two_by_two, missing=True)
+    observer = controller.observer
+    # Of the first output alone, from the steady covariance.
+    before, gain = np.zeros(4), observer.L @ observer.S[:, 0] / observer.S[0, 0]
     controller.reset([0.0, 0.0])
     twin.reset([0.0, 0.0])
     controller.step([0.1, bad], [0.3, 0.2])
     H, F = controller.observer.H, controller.observer.F
-    corrected = before + gain[:, 0] * (0.1 - H[0] @ before)
+    corrected = before + gain * (0.1 - H[0] @ before)
     predicted = F @ corrected + controller.observer.G @ controller.u
     assert np.allclose(np.concatenate((controller.x, controller.w)), predicted)
     assert twin.step([0.1, np.nan if bad is None else bad], [[0.3, 0.2]])[1] == Outcome.MISSING
@@ -194,7 +196,7 @@ def test_the_switch_to_automatic_has_no_bump():
 
 @pytest.mark.parametrize("u", [[None], [np.nan], [3.4e38], [-np.inf]])
 def test_the_last_input_stands_for_one_that_is_not_known(u):
-    controller, twin = exported(tanks)
+    controller, twin = exported(tanks, missing=True)
     controller.reset(y=[10.0], u=[4.0])
     twin.reset([10.0], [4.0])
     numbers = [np.nan if x is None else x for x in u]
@@ -270,7 +272,10 @@ def test_new_bounds_and_weights_keep_the_estimates():
 
 
 def test_c_and_python_do_the_same_in_all_bad_hours():
-    pairs = exported(two_by_two, y_bounds=(-1.0, 1.0)), exported(two_signals)
+    pairs = (
+        exported(two_by_two, missing=True, y_bounds=(-1.0, 1.0)),
+        exported(two_signals, missing=True),
+    )
     for i, pair in enumerate(pairs):
         difference, counts = soak(*pair, 600, 3, i)
         assert difference < 1e-9

@@ -206,7 +206,7 @@ def export_controller_fmu(
     """Write a controller as an FMU; see `Controller.export_fmu`."""
     required_compiler()
     with tempfile.TemporaryDirectory() as folder:
-        report = export_controller(law, memory, folder, name=name, **options)
+        report = export_controller(law, memory, folder, name=name, missing=True, **options)
         texts = {file.name: file.read_text(encoding="utf-8") for file in report.files}
     file = write_fmu(path, name, texts, _variables(law, memory), law.design.plant.dt or 1.0)
     return replace(report, files=(file,))

@@ -100,7 +100,7 @@ def _cost(design: Design, layout: Layout) -> Cost:
     return Cost(stage, terminal, hessian="block", q=q)
 
 
-def _squares(T: Array, weight: Array) -> Array:
+def _squares(T: Array, weight: Any) -> Array:
     """Return ``2 T' weight T``, whose rounding is asymmetric, made symmetric."""
     half = T.T @ weight @ T
     return half + half.T

@@ -311,7 +311,7 @@ static int worst(const policy_state *s, real tolerance, int *side, real *excess,
         else if (kind == -SATURATED) off = larger(below, 0);
         else if (kind != IGNORED) off = kind > 0 ? above : below;
         size = absolute(off);
-        if (size <= tolerance * terms_of(s, i, kind ? kind : off) + ROUNDING * sum) continue;
+        if (size <= tolerance * terms_of(s, i, kind ? (real)kind : off) + ROUNDING * sum) continue;
         if (kind == HELD || kind == -HELD) {
             *settled = 0;
             continue;

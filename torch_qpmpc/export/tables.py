@@ -217,8 +217,8 @@ def _solve(factor: Array, right: Array) -> Array:
 def _rows(Y: Array, y_0: Array, unit: Array | float, lb: Array, ub: Array, w: Array) -> Rows:
     unit = np.broadcast_to(unit, y_0.shape)
     upper = np.maximum(lb, ub)  # bounds that cross by rounding are equal
-    ends, size = ((x - y_0) / unit for x in (lb, upper)), np.abs(y_0) / unit
-    return Rows(Y / unit[:, None], *ends, w * unit, size, unit)
+    below, above, size = (lb - y_0) / unit, (upper - y_0) / unit, np.abs(y_0) / unit
+    return Rows(Y / unit[:, None], below, above, w * unit, size, unit)
 
 
 def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:

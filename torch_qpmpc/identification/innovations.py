@@ -92,8 +92,8 @@ class Innovations(NamedTuple):
         seen, xi = ~np.isnan(y), np.empty((*y.shape[:2], n))
         for rows in alike(seen):
             run = self.course(seen[rows[0]])
-            parts = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
-            prior, e = filtered(self.A, self.C, run, *parts, self.x0)
+            outputs, moved = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
+            prior, e = filtered(self.A, self.C, run, outputs, moved, self.x0)
             xi[rows] = np.moveaxis(prior + applied(run.K, e), 0, 1)
         return xi.reshape(*batch, -1, n)
 

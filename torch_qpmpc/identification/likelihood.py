@@ -52,7 +52,7 @@ def batches(data: Sequence[Signals]) -> list[tuple[list[int], Array, Array]]:
     for i, one in enumerate(data):
         groups[len(one.v)].append(i)
     return [
-        (group, *map(np.stack, zip(*(data[i] for i in group), strict=True)))
+        (group, np.stack([data[i].y for i in group]), np.stack([data[i].v for i in group]))
         for group in groups.values()
     ]
 

@@ -82,11 +82,12 @@ def make_plant(cfg: DictConfig) -> GymnasiumPlant:
 def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
     """Read the model and the weight from the task's configuration, the bounds from the spaces.
 
-    With ``start=data``, those that are null are None. The bounds of the observations count with
-    ``task.observation_bounds`` only.
+    With ``start=data`` the log's model takes the place of A and B, and the weight may be null. The
+    weight is of the observations and actions: hidden states have none. The bounds of the
+    observations count with ``task.observation_bounds`` only.
     """
-    n_x, n_u = plant.n_x, len(plant.lb_a)
-    shapes = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_x + n_u, n_x + n_u)}
+    n_x, n_y, n_u = plant.n_x, len(plant.lb_s), len(plant.lb_a)
+    shapes = {"A": (n_x, n_x), "B": (n_x, n_u), "stage_weight": (n_y + n_u, n_y + n_u)}
     for name, shape in shapes.items():
         if cfg.task[name] is None and cfg.start.name != "data":
             expected = f"the rows of a matrix {shape} for {plant.id!r}"
@@ -95,9 +96,15 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         None if rows is None else torch.tensor(rows, dtype=torch.float64)
         for rows in map(cfg.task.get, shapes)
     )
+    if cfg.start.name == "data":
+        A = B = None
+    if weight is not None and len(weight) == n_y + n_u:  # the outputs are the first states
+        seen = torch.cat((torch.arange(n_y), torch.arange(n_x, n_x + n_u)))
+        own, weight = weight, weight.new_zeros(n_x + n_u, n_x + n_u)
+        weight[seen[:, None], seen] = own
     states = torch.full((2, n_x), torch.inf, dtype=torch.float64)
     states[0] = -states[0]
-    if cfg.task.observation_bounds:  # the outputs are the first states
+    if cfg.task.observation_bounds:
         states[0, : len(plant.lb_s)], states[1, : len(plant.ub_s)] = plant.lb_s, plant.ub_s
     return plant_scheme(cfg, plant, Model(A, B), weight, (states[0], states[1]))
 

@@ -155,12 +155,12 @@ def report(status: np.ndarray, batch: torch.Size, on_failure: str) -> None:
     statuses = torch.as_tensor(status)
     failed = statuses.nonzero().squeeze(-1)
     reasons = []
-    for status in Status:
-        where = (statuses == status).nonzero().squeeze(-1)
-        if status != Status.SOLVED and len(where):
+    for kind in Status:
+        where = (statuses == kind).nonzero().squeeze(-1)
+        if kind != Status.SOLVED and len(where):
             first = torch.unravel_index(where[0], batch) if batch else ()
             at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
-            reasons.append(f"{len(where)} {status.name}{at}: {status.explanation}")
+            reasons.append(f"{len(where)} {kind.name}{at}: {kind.explanation}")
     message = f"{len(failed)} of {len(statuses)} QPs have no certified solution. " + ". ".join(
         reasons
     )
