@@ -6,6 +6,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import DictConfig
@@ -18,7 +19,9 @@ from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.gymnasium import given_scheme
 from torch_qpmpc.experiment.tasks.identified import identified_start
+from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
 from torch_qpmpc.study.runs import FinishedRun
 
@@ -99,6 +102,21 @@ def test_a_task_with_a_weight_gets_the_model_of_the_log(constraint):
     assert torch.equal(mpc.H, other.H)
     assert torch.equal(mpc.ub, other.ub)
     assert mpc.learned == other.learned
+
+
+def test_a_weight_is_of_the_observations_where_the_log_s_model_has_hidden_states():
+    """That model takes the place of the task's A and B, which have three states."""
+    cfg = make_config("task=pendulum", "start=data")
+    A, B, E, C = np.eye(5), np.zeros((5, 1)), np.zeros((5, 0)), np.eye(3, 5)
+    rest = np.zeros(5), C, C.T, np.eye(3), np.zeros(5), np.eye(5)
+    scheme = given_scheme(cfg, make_physics(cfg).observed(Innovations(A, B, E, *rest)))
+    weight = scheme.cost.stage_weight
+    own = torch.tensor(cfg.task.stage_weight, dtype=torch.float64)
+    assert weight is not None
+    assert torch.equal(weight[[0, 1, 2, 5]][:, [0, 1, 2, 5]], own)
+    assert not weight[3:5].any()
+    assert not weight[:, 3:5].any()
+    assert scheme.layout.n_x == 5
 
 
 @pytest.mark.usefixtures("store_task")
