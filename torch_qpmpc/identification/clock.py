@@ -76,12 +76,12 @@ def seconds(column: pd.Series, day_first: bool | None) -> tuple[np.ndarray, str,
 
     An empty entry is as far between its neighbours as its row.
     """
-    name, empty = str(column.name), column.isna().to_numpy()
+    name, empty = str(column.name), column.isna().sum()
     if isinstance(column.dtype, pd.PeriodDtype):
         column = column.dt.to_timestamp()
     readings = [x.continued() for x in _readings(column, day_first)]
-    if empty.sum() > len(column) - 2:
-        got = f"{name}, empty in {empty.sum()} of {len(column)} rows"
+    if empty > len(column) - 2:
+        got = f"{name}, empty in {empty} of {len(column)} rows"
         raise QPError.expected("time", got, "times in two rows or more", "Omit time=.")
     if not readings:
         got = f"{name} with {_odd(column)!r}"
@@ -91,13 +91,14 @@ def seconds(column: pd.Series, day_first: bool | None) -> tuple[np.ndarray, str,
     if told := _doubt(name, chosen, readings, best):
         warnings.warn(told, UserWarning, stacklevel=5)
     unit = "" if chosen.name == NUMBERS else "s"
-    notes = [] if chosen.name in (NUMBERS, "dates") else [f"{name} is read as {chosen.name}"]
-    times, rows = chosen.times, np.arange(len(column))
-    if empty.any():
-        known = np.isfinite(times)
-        between = np.interp(rows, rows[known], times[known], np.nan, np.nan)
-        times = np.where(empty, between, times)
-        notes.append(f"{name} is empty in {empty.sum()} rows, which are between their neighbours")
+    plain = chosen.name == NUMBERS or chosen.name.startswith("dates")
+    notes = [] if plain else [f"{name} is read as {chosen.name}"]
+    times, rows, known = chosen.times, np.arange(len(column)), np.isfinite(chosen.times)
+    if not known.all():
+        times = np.interp(rows, rows[known], times[known], np.nan, np.nan)
+        notes.append(
+            f"{name} is empty in {(~known).sum()} rows, which are between their neighbours"
+        )
     return times, unit, notes
 
 
