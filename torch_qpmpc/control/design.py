@@ -337,6 +337,8 @@ def within_levels(
     Raises:
         QPError: no level of an input is within its bounds.
     """
+    if not levels:
+        return bounds
     lower, upper = (side.copy() for side in bounds)
     for name, own in levels.items():
         a = plant.inputs.index(name)
