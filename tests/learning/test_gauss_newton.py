@@ -28,7 +28,7 @@ PARTS = {
     "full": {"hessian": "full", "stage_weight": torch.eye(3), "learn": ("H", "C")},
     "projected": {"step": "projection", "hessian": "full", "learn": ("H", "w"), "free": 0.01},
     "tied": {"structure": "tied", "learn": ("c", "q", "C", "b", "lb", "ub", "w"), "free": 0.01},
-    "varying": {"structure": "varying", "learn": ("C", "G"), **MIXED},
+    "mixed": {"structure": "tied", "learn": ("C", "G"), **MIXED},
     "blocks": {"blocks": [1, 2], "learn": ("H", "c", "C")},
     "preview": {"n_d": 1, "learn": ("H", "q", "c", "C", "b")},
 }

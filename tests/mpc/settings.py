@@ -89,7 +89,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "no bounds": {"state_bounds": None, "action_bounds": None},
     "everything learned": {"learn": EVERYTHING, "hessian": "block", "action_slack": 50.0},
     "of one stage": {"horizon": 1},
-    "varying, mixed": {"structure": "varying", "learn": ("C", "G", "w"), **MIXED},
+    "tied, mixed": {"structure": "tied", "learn": ("C", "G", "w"), **MIXED},
     "free, mixed": {"learn": ("C", "G", "w"), "action_slack": 50.0, **MIXED},
     "projected block": {"step": "projection", "hessian": "block", "learn": ("H", "H_f", "C", "w")},
     "by proxqp": {"solver": "proxqp"},
@@ -97,7 +97,7 @@ PAPER: dict[str, dict[str, Any]] = {
 }
 LINEAR: dict[str, dict[str, Any]] = {
     "tied": {},
-    "varying, mixed rows": {"structure": "varying", **MIXED},
+    "tied, mixed rows": MIXED,
     "tied, diagonal": {"hessian": "diagonal", "stage_weight": [1.0, 0.5, 0.1]},
     "tied, full": {"hessian": "full"},
     "hard rows": {"constraint_slack": torch.inf, "constraints": ([[0.0, 0, 1]], [-0.4], [0.4])},
@@ -106,7 +106,6 @@ PREVIEWED: dict[str, dict[str, Any]] = {
     "preview": {},
     "preview, full": {"hessian": "full"},
     "preview, tied": {"structure": "tied"},
-    "preview, varying, full": {"structure": "varying", "hessian": "full"},
     "preview, projected": {"structure": "tied", "hessian": "diagonal", "step": "projection"},
     "preview, torch": {"solver": "torch"},
 }

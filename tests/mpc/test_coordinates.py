@@ -24,7 +24,6 @@ MIXED_WITH_PREVIEW: dict[str, Any] = {
 KINDS: dict[str, dict[str, Any]] = {
     "free": {},
     "tied": {"structure": "tied", "hessian": "block", **MIXED},
-    "varying": {"structure": "varying", **MIXED},
     "preview": {"n_d": 1, "hessian": "block"},
     "tied preview": {"n_d": 1, "structure": "tied", **MIXED_WITH_PREVIEW},
     "full": {"hessian": "full"},

@@ -23,7 +23,7 @@ KINDS = {
     "block": {"hessian": "block"},
     "full": {"hessian": "full"},
     "tied": {"structure": "tied", "learn": ("H", "C", "q", "b", "w")},
-    "varying": {"structure": "varying", "learn": ("C", "G"), "discount_slack": True, **MIXED},
+    "mixed": {"structure": "tied", "learn": ("C", "G"), "discount_slack": True, **MIXED},
     "preview": {"n_d": 2, "hessian": "block"},
     "tied preview": {"n_d": 1, "structure": "tied", "learn": ("H", "C", "q", "b", "w")},
 }
@@ -185,7 +185,7 @@ def test_a_shallow_copy_shares_the_parameters():
     assert_close(twin.value(S), mpc.value(S), rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("kind", ["tied", "varying", "tied preview"])
+@pytest.mark.parametrize("kind", ["tied", "mixed", "tied preview"])
 def test_a_release_leaves_the_copies_as_they_are(kind):
     mpc = random_mpc(0, **KINDS[kind])
     s = known(mpc)

@@ -58,7 +58,7 @@ class Constraint(Group):
     """The learned constraints and their penalties; a null penalty is off."""
 
     name: str
-    structure: Literal["free", "varying", "tied"]
+    structure: Literal["free", "tied"]
     learn: list[Literal["C", "b", "G", "lb", "ub"]]
     deviation: Deviation | None
     si: SystemIdentification | None

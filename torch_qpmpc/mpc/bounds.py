@@ -128,7 +128,7 @@ class Bounds:
             price[: layout.n_mixed],
             price[layout.n_mixed :],
         )
-        G = LinearRows(layout, tied=True)(D[0], D_f[0])
+        G = LinearRows(layout)(D[0], D_f[0])
         return {"G": G, "lb": lower, "ub": upper, "w": w}
 
 

@@ -81,8 +81,8 @@ class QPMPC(nn.Module):
             mapping, ``{"H": True, "C": mask}``, a mask is True at the entries that are learned.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
             (eq:qp5). ``"tied"``: a linear MPC scheme (eq:q1), with one A, B, D and one entry
-            of b, q, lb, ub and w for all stages; ``"varying"``: with one for each stage.
-            In both, the bounds of hard rows are known limits (eq:v1c3), and are not learned.
+            of b, q, lb, ub and w for all stages, where the bounds of hard rows are known limits
+            (eq:v1c3), and are not learned.
         step: the rule that keeps H and H_f positive semidefinite and w non-negative (eq:sdp1).
             ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``: theta is H
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
@@ -420,39 +420,26 @@ class QPMPC(nn.Module):
         return self.layout.predicted(check_tensor("z", z, self.n_z))
 
     def model(self) -> tuple[Tensor, ...]:
-        """Return A and B, ``(n_x, L n_x)`` and ``(n_x, L n_u)``, with a leading N if they vary.
-
-        With a preview, E ``(n_x, n_d)`` is the third.
+        """Return A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, and with a preview E ``(n_x, n_d)``.
 
         Raises:
             QPError: C is free, and need not contain a model; or there is a schedule.
         """
         check_one_model(self)
         if self.structure == "free":
-            raise QPError.expected("structure", "'free'", "'tied' or 'varying', which have a model")
-        return Banded(self.layout, self.structure == "tied").right_inverse(self.C)
+            raise QPError.expected("structure", "'free'", "'tied', which has a model")
+        return Banded(self.layout).right_inverse(self.C)
 
     def readable(self) -> dict[str, Tensor]:
         """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
         return parameters.readable(self, self.learned)
 
-    def release(self, structure: str = "free") -> None:
-        """Remove ties of a linear MPC scheme in place, without a change of values.
+    def release(self) -> None:
+        """Remove the ties of a linear MPC scheme in place, without a change of values.
 
         The learned parts get new parameters: create the loss module and the optimiser again.
-
-        Args:
-            structure: ``"free"`` or ``"varying"``, freer than the current structure.
-
-        Raises:
-            QPError: ``structure`` is not freer.
         """
-        freer = STRUCTURES[: STRUCTURES.index(self.structure)]
-        if structure not in freer:
-            expected = f"one that is freer than {self.structure!r}"
-            remedy = f"Those are: {', '.join(freer) or 'none'}."
-            raise QPError.expected("structure", repr(structure), expected, remedy)
-        self.structure = structure
+        self.structure = "free"
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
                 value = getattr(self, part).detach()

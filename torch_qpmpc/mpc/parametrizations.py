@@ -32,8 +32,8 @@ def parametrizations_for(
     ``mask`` is True at the entries that are learned; None if all are.
     """
     chain, tied = [], structure == "tied"
-    if structure != "free" and name in ("C", "G"):
-        chain.append((Banded if name == "C" else LinearRows)(layout, tied))
+    if tied and name in ("C", "G"):
+        chain.append((Banded if name == "C" else LinearRows)(layout))
     if tied and name in ("q", "b", "lb", "ub", "w"):
         chain.append(Tied(name, layout.ties(name)))
     dense = hessian != "diagonal" and name != "w"
@@ -165,22 +165,18 @@ class Masked(nn.Module):
 
 
 class Banded(nn.Module):
-    """C of a model (eq:cband) from A, B and, with a preview, E; see `banded_matrix`.
+    """C of a model (eq:cband) from A, B and, with a preview, E; see `banded_matrix`."""
 
-    They have a leading N if they vary by stage.
-    """
-
-    def __init__(self, layout: Layout, tied: bool) -> None:
+    def __init__(self, layout: Layout) -> None:
         super().__init__()
-        self.layout, self.tied = layout, tied
+        self.layout = layout
 
     def forward(self, A: Tensor, B: Tensor, E: Tensor | None = None) -> Tensor:
         return banded_matrix(A, B, self.layout.horizon, E)
 
     def right_inverse(self, C: Tensor) -> tuple[Tensor, ...]:
         """Return the model in the band of C; raise `QPError` if C has other entries."""
-        parts = model_of(C, self.layout)
-        model = tuple((part[0] if self.tied else part).contiguous() for part in parts)
+        model = tuple(part[0].contiguous() for part in model_of(C, self.layout))
         _check_tied("C", C, self(*model))
         return model
 
@@ -215,13 +211,12 @@ class Tied(nn.Module):
 class LinearRows(nn.Module):
     """G of mixed constraints (eq:v1c4): the plan, D for each stage and D^f for x_N.
 
-    D is ``(n_mixed, n_d + n_x + n_u)``, with a leading N if it varies by stage, and D^f
-    ``(n_terminal, n_d + n_x)``.
+    D is ``(n_mixed, n_d + n_x + n_u)``, and D^f ``(n_terminal, n_d + n_x)``.
     """
 
-    def __init__(self, layout: Layout, tied: bool) -> None:
+    def __init__(self, layout: Layout) -> None:
         super().__init__()
-        self.layout, self.tied = layout, tied
+        self.layout = layout
 
     def forward(self, D: Tensor, D_f: Tensor) -> Tensor:
         layout = self.layout
@@ -232,8 +227,7 @@ class LinearRows(nn.Module):
     def right_inverse(self, G: Tensor) -> tuple[Tensor, Tensor]:
         """Return D and D^f; raise `QPError` if G has other entries."""
         D, D_f = _linear_rows(G, self.layout)
-        D = self.layout.stage_blocks(D)
-        D, D_f = (D[0] if self.tied else D).contiguous(), self.layout.terminal_block(D_f)
+        D, D_f = self.layout.stage_blocks(D)[0].contiguous(), self.layout.terminal_block(D_f)
         _check_tied("G", G, self(D, D_f))
         return D, D_f
 
@@ -248,7 +242,7 @@ def _check_mask(name: str, mask: Tensor, layout: Layout, chain: list[nn.Module])
     for part in chain:
         if isinstance(part, Tied):
             tied = torch.equal(mask, mask[part.first][part.index])
-        elif isinstance(part, Banded | LinearRows) and part.tied:
+        elif isinstance(part, Banded | LinearRows):
             rows = _linear_rows(mask, layout)[0] if name == "G" else mask
             blocks = layout.stage_blocks(rows)
             tied = bool((blocks == blocks[:1]).all())

@@ -19,8 +19,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 #: Largest asymmetry of a weight's entry, relative to its row and column.
 ASYMMETRY = 1e-5
-#: In order, from the least tied to the most.
-STRUCTURES = ("free", "varying", "tied")
+STRUCTURES = ("free", "tied")
 #: The parts of theta by family; the paper advises a different learning rate for each.
 COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
