@@ -125,7 +125,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("state_slack: got 'inf', expected a non-negative weight, or inf for", M(state_slack="inf")),
     ("discount_slack: got 'no', expected True or False.", M(discount_slack="no")),
     ("learn: got None, expected a collection of names among H, H_f, q, c, w, C, b", M(learn=None)),
-    ("hessian: got ['block'], expected one of diagonal, block, full.", M(hessian=["block"])),
+    ("hessian: got ['block'], expected one of diagonal, block.", M(hessian=["block"])),
     ("terminal_weight: got 'ricatti' with hessian='diagonal'", M(terminal_weight="ricatti")),
     ("offset: got shape (1,), expected shape (2,).", M(offset=[1.0])),
     ("constraints: got ([[1.0, 0, 0]], [1.0]), expected", M(constraints=([[1.0, 0, 0]], [1.0]))),

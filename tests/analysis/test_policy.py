@@ -13,7 +13,7 @@ A = torch.tensor([[1.0, 0.2], [-0.1, 1.1]], dtype=torch.float64)
 B = torch.tensor([[0.0, 0.1], [0.3, 0.1]], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("hessian", ["diagonal", "block"])
 def test_stage_weight_is_that_of_the_first_pair(hessian):
     weight = torch.tensor([2.0, 1.0, 0.3, 0.5])
     mpc = QPMPC.from_model(A, B, 3, hessian=hessian, stage_weight=weight, learn=("H", "C"))

@@ -71,8 +71,6 @@ def previewed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
     settings |= options
     if settings["hessian"] == "diagonal":
         settings |= {"stage_weight": [1.0, 2.0, 0.5], "terminal_weight": [1.0, 1.0]}
-    if settings["hessian"] == "full" and "learn" not in options:
-        settings["learn"] = [part for part in EVERYTHING if part != "H_f"]
     return shifted(QPMPC.from_model(A_D, B_D, N, **settings), free, seed)
 
 
@@ -99,12 +97,10 @@ LINEAR: dict[str, dict[str, Any]] = {
     "tied": {},
     "tied, mixed rows": MIXED,
     "tied, diagonal": {"hessian": "diagonal", "stage_weight": [1.0, 0.5, 0.1]},
-    "tied, full": {"hessian": "full"},
     "hard rows": {"constraint_slack": torch.inf, "constraints": ([[0.0, 0, 1]], [-0.4], [0.4])},
 }
 PREVIEWED: dict[str, dict[str, Any]] = {
     "preview": {},
-    "preview, full": {"hessian": "full"},
     "preview, tied": {"structure": "tied"},
     "preview, projected": {"structure": "tied", "hessian": "diagonal", "step": "projection"},
     "preview, torch": {"solver": "torch"},

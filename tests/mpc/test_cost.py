@@ -46,7 +46,7 @@ def test_bad_arguments_are_named(arguments, message):
             "terminal_weight: got smallest eigenvalue -1, expected a positive semidefinite weight",
         ),
         (
-            {"terminal_weight": [[1.0, 0.5], [0.0, 1.0]], "hessian": "full"},
+            {"terminal_weight": [[1.0, 0.5], [0.0, 1.0]], "hessian": "block"},
             r"terminal_weight: got asymmetry 0.5, .* Pass \(W \+ W.mT\) / 2",
         ),
         ({"q": [1.0]}, r"q: got shape \(1,\), expected shape \(11,\)"),

@@ -86,9 +86,8 @@ def test_without_active_bounds_it_is_the_linear_quadratic_regulator(horizon, n_d
     assert_close(mpc.policy(p).detach(), -s @ gain.mT, rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize("hessian", ["block", "full"])
-def test_the_plan_follows_the_model_keeps_the_bounds_and_has_its_cost(hessian):
-    mpc = previewed(free=0.0, hessian=hessian)
+def test_the_plan_follows_the_model_keeps_the_bounds_and_has_its_cost():
+    mpc = previewed(free=0.0)
     p, _ = inputs(mpc)
     solution = mpc.solve(p)
     x, u = mpc.predicted(solution.z.detach())
@@ -224,7 +223,7 @@ def test_outputs_have_the_batch_and_the_dtype_of_the_states(batch, dtype):
 
 
 @pytest.mark.parametrize("discounted", [False, True])
-@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("hessian", ["diagonal", "block"])
 def test_without_a_past_and_a_preview_it_is_the_papers_qp_to_the_last_bit(hessian, discounted):
     A, B = normal(N_X, N_X, seed=1), normal(N_X, N_U, seed=2)
     weights, last = torch.tensor([1.0, 0.5, 0.1]).double(), torch.tensor([2.0, 3.0]).double()
@@ -368,19 +367,17 @@ def test_no_optimiser_moves_the_bounds_of_hard_rows():
 
 
 @pytest.mark.parametrize("step", ["projection", "sdp"])
-@pytest.mark.parametrize("hessian", ["block", "full"])
-def test_a_projection_changes_the_block_of_the_plan_alone(step, hessian):
-    mpc = previewed(free=0.0, step=step, hessian=hessian)
+def test_a_projection_changes_the_block_of_the_plan_alone(step):
+    mpc = previewed(free=0.0, step=step)
     leaf = mpc.leaves("H")[0]
     with torch.no_grad():
         leaf -= 1.5 * torch.eye(leaf.shape[-1])
         before = leaf.clone()
         mpc.project_()
-    free = N_P - N_X if hessian == "full" else N_D
-    assert torch.equal(leaf[:free], before[:free])
-    assert torch.equal(leaf[:, :free], before[:, :free])
-    assert torch.linalg.eigvalsh(before[free:, free:])[0] < -0.5
-    assert torch.linalg.eigvalsh(leaf[free:, free:])[0] > -1e-9
+    assert torch.equal(leaf[:N_D], before[:N_D])
+    assert torch.equal(leaf[:, :N_D], before[:, :N_D])
+    assert torch.linalg.eigvalsh(before[N_D:, N_D:])[0] < -0.5
+    assert torch.linalg.eigvalsh(leaf[N_D:, N_D:])[0] > -1e-9
     assert mpc.value(inputs(mpc)[0]).isfinite().all()
 
 
@@ -476,7 +473,7 @@ def from_checkpoint(mpc: QPMPC, name: str) -> QPMPC:
 
 
 #: Settings that files keep in different ways.
-KEPT = ("masked", "tied, mixed", "projected block", "tied, full", "preview, tied", "no bounds")
+KEPT = ("masked", "tied, mixed", "projected block", "tied, diagonal", "preview, tied", "no bounds")
 
 
 @pytest.mark.parametrize(
@@ -562,10 +559,6 @@ MODEL: dict[str, Any] = {"A": A, "B": B, "hessian": "block", "stage_weight": W}
     ("options", "message"),
     [
         ({"learn": "HC"}, "learn: got 'HC', expected a collection of names among H, H_f, q"),
-        (
-            {"learn": ["H", "H_f"], "hessian": "full"},
-            "learn: got 'H_f' with hessian='full', expected 'H' alone. A full H contains",
-        ),
         ({"structure": "banded"}, "structure: got 'banded', expected one of free, tied"),
         (
             {"structure": "tied", "learn": ["G"]},

@@ -20,11 +20,10 @@ from torch_qpmpc.mpc import projections as steps
 from torch_qpmpc.mpc.parameters import leaves
 from torch_qpmpc.mpc.projections import NEAREST, STEPS, nearest_psd, nearest_psd_by_sdp
 
-#: Both dense forms of H and the paper's diagonal, with learned ``w``.
+#: Dense blocks and the paper's diagonal, with learned ``w``.
 HESSIANS: dict[str, dict[str, Any]] = {
     "diagonal": {"hessian": "diagonal", "learn": ("H", "H_f", "q", "c", "C", "w")},
     "block": {"hessian": "block", "learn": ("H", "H_f", "q", "c", "C", "w")},
-    "full": {"hessian": "full", "learn": ("H", "q", "c", "C", "w")},
     "tied": {"hessian": "block", "learn": ("H", "H_f", "C", "w"), "structure": "tied"},
 }
 
@@ -41,8 +40,6 @@ def solve(cost: Any, constraints: list[Any]) -> None:
 
 def hessian_of(mpc: QPMPC, H: Any, H_f: Any) -> Any:
     """Write the QP's undiscounted H in cvxpy, as in the paper."""
-    if mpc.hessian == "full":
-        return H
     dense = [cp.diag(x) if mpc.hessian == "diagonal" else x for x in (H, H_f)]
     sizes = [mpc.n_x + mpc.n_u] * mpc.horizon + [mpc.n_x]
     blocks = [dense[0]] * mpc.horizon + [dense[1]]
@@ -72,14 +69,14 @@ def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
         for name, p in parameters.items()
         if p.grad is not None
     )
-    H = hessian_of(mpc, theta["H"], theta.get("H_f"))
+    H = hessian_of(mpc, theta["H"], theta["H_f"])
     of_qp = cp.multiply(torch.outer(root, root).numpy(), H)
     solve(cost, [of_qp >> 0, theta["w"] >= 0])
     return {name: torch.as_tensor(x.value) for name, x in theta.items()}
 
 
 @pytest.mark.parametrize("rule", NEAREST)
-@pytest.mark.parametrize("name", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("name", ["diagonal", "block"])
 def test_a_projected_gradient_step_is_the_papers(name, rule):
     rate = 2.0
     mpc = random_mpc(1, horizon=2, step=rule, action_slack=1.0, state_slack=1.0, **HESSIANS[name])
@@ -205,7 +202,7 @@ def test_the_weights_keep_their_sign_while_learning(rule, name, optimizer):
     assert min(lowest) < 0.05, "they have come to the boundary"
 
 
-@pytest.mark.parametrize("name", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("name", ["diagonal", "block"])
 def test_gauss_newton_judges_the_projected_step(name):
     mpc = random_mpc(4, step="projection", hessian=name, learn=("H", "q"))
     s, a = random_states(5, size=0.9), random_states(5, 1, size=0.4)

@@ -105,7 +105,7 @@ def test_a_log_of_few_rows_has_a_cost_or_says_why_not(rows):
             fit_rewards([data, data], LAYOUT)
 
 
-@pytest.mark.parametrize("hessian", ["diagonal", "block", "full"])
+@pytest.mark.parametrize("hessian", ["diagonal", "block"])
 def test_the_cost_of_a_plan_is_the_sum_of_its_stages(hessian):
     """x_N has the stage's cost, without an action."""
     gamma = 0.8

@@ -21,7 +21,6 @@ from torch_qpmpc.qp.solvers import BACKENDS
 KINDS = {
     "diagonal": {},
     "block": {"hessian": "block"},
-    "full": {"hessian": "full"},
     "tied": {"structure": "tied", "learn": ("H", "C", "q", "b", "w")},
     "mixed": {"structure": "tied", "learn": ("C", "G"), "discount_slack": True, **MIXED},
     "preview": {"n_d": 2, "hessian": "block"},

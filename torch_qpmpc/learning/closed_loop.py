@@ -270,9 +270,9 @@ def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
     kept = torch.cat(
         (torch.arange(layout.n_d), torch.arange(layout.n_preview, layout.n_p + layout.n_u))
     )
-    blocks = tuple(theta[name] for name in ("H", "H_f") if name in theta)
     one = torch.ones(layout.n_z, dtype=torch.float64)
-    H, q = layout.hessian(scheme.cost.hessian, blocks, one)[kept][:, kept], theta["q"][kept]
+    H = layout.hessian(scheme.cost.hessian, theta["H"], theta["H_f"], one)[kept][:, kept]
+    q = theta["q"][kept]
     G, lb, ub, w = (theta[name] for name in ("G", "lb", "ub", "w"))
     others = torch.ones(layout.n_z, dtype=torch.bool).index_fill(0, kept, False)
     rows = w.isfinite() & ~(G[:, others] != 0).any(1)

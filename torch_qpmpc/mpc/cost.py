@@ -15,7 +15,7 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.riccati import RICCATI, terminal_riccati
 from torch_qpmpc.mpc.validation import check_weight, owned
 
-HESSIANS = ("diagonal", "block", "full")
+HESSIANS = ("diagonal", "block")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Cost:
             of least stage cost for d_N; not for a diagonal hessian. This is the default if it
             exists, for one dense stage weight and no q; else the stage's own weight is. With a
             random stage weight it is the identity.
-        hessian: ``"diagonal"``, ``"block"`` (one dense block a stage) or ``"full"`` (dense in z).
+        hessian: ``"diagonal"`` or ``"block"``, one dense block a stage.
         q, c: the linear cost ``(n_z,)`` and the constant, without discounts; zero by default.
 
     Raises:
@@ -60,7 +60,7 @@ class Cost:
             names.append("terminal_weight")
         elif self.terminal_weight != RICCATI or self.hessian == "diagonal":
             got = f"{self.terminal_weight!r} with hessian={self.hessian!r}"
-            want = f"a tensor, or {RICCATI!r} with hessian='block' or 'full'"
+            want = f"a tensor, or {RICCATI!r} with hessian='block'"
             raise QPError.expected("terminal_weight", got, want)
         for name in names:
             object.__setattr__(self, name, owned(name, getattr(self, name)))
@@ -68,7 +68,7 @@ class Cost:
     def hessians(
         self, layout: Layout, A: Tensor, B: Tensor, gamma: float, random: torch.Generator
     ) -> dict[str, Tensor]:
-        """Return H and H_f of the sizes ``layout`` in the shapes for ``hessian``; a full H alone.
+        """Return H and H_f of the sizes ``layout`` in the shapes for ``hessian``.
 
         A terminal weight of the regulator is that of ``A``, ``B`` and ``gamma``; ``random`` draws a
         stage weight that is None.
@@ -137,8 +137,6 @@ def _blocks(stage: Tensor, terminal: Tensor, hessian: str, layout: Layout) -> di
         raise QPError.expected("terminal_weight", got, f"shape {terminal_event}")
     check_weight("stage_weight", stage, diagonal, n_d)
     check_weight("terminal_weight", terminal, diagonal, n_d)
-    if hessian == "full":
-        return {"H": layout.block_hessian(stage, terminal)}
     return {"H": stage, "H_f": terminal}
 
 

@@ -185,22 +185,18 @@ class Layout:
         D_f = none.new_zeros(self.n_terminal)
         return self.rows(none, u, repeating & of_actions, D_f)
 
-    def hessian(self, kind: str, blocks: tuple[Tensor, ...], discount: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` (eq:qpH) from the ``blocks`` of a ``kind`` of hessian.
+    def hessian(self, kind: str, stages: Tensor, terminal: Tensor, discount: Tensor) -> Tensor:
+        """Return H ``(n_z, n_z)`` (eq:qpH) from the weights of the stages and of x_N.
 
-        Those of the kind "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H has entries
-        for the plan only. ``discount`` has an entry for each of z.
+        Those of the ``kind`` "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H has
+        entries for the plan only. ``discount`` has an entry for each of z.
         """
-        H = blocks[0]
         if kind == "diagonal":
             # Operations whose batched gradients (`GaussNewton`) are not a loop over the batch.
-            before, stages = H.new_zeros(self.n_preview), H.expand(self.horizon, self.n)
-            entries = torch.cat((before, stages.flatten(), blocks[1]))
-            return torch.diag_embed(discount * entries)
-        if kind == "block":
-            H = self.block_hessian(H, blocks[1])
+            before, plan = stages.new_zeros(self.n_preview), stages.expand(self.horizon, self.n)
+            return torch.diag_embed(discount * torch.cat((before, plan.flatten(), terminal)))
         root = discount.sqrt()
-        return root.unsqueeze(-1) * H * root
+        return root.unsqueeze(-1) * self.block_hessian(stages, terminal) * root
 
     def block_hessian(self, stage: Tensor, terminal: Tensor) -> Tensor:
         """Return H without discounts: ``stage`` of (d_k, x_k, u_k), one or N, and ``terminal``."""

@@ -154,7 +154,7 @@ class QPMPC(nn.Module):
         check_choice("structure", structure, STRUCTURES)
         check_choice("on_failure", on_failure, ON_FAILURE)
         check_step(step)
-        check_learn(learn, structure, scheme.cost.hessian, scheme.layout.n_linear)
+        check_learn(learn, structure, scheme.layout.n_linear)
         backend(solver)
         self.scheme, self.layout, self._random = scheme, scheme.layout, scheme.is_random
         self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
@@ -183,7 +183,7 @@ class QPMPC(nn.Module):
         self._derive()
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
-        self._block_ndims = [theta[name].ndim for name in ("H", "H_f") if name in theta]
+        self._block_ndims = [theta[name].ndim for name in ("H", "H_f")]
         for name, start in theta.items():
             if name in self.learned:
                 parameters.attach(
@@ -293,8 +293,6 @@ class QPMPC(nn.Module):
         """
         hessian = options.get("hessian", "block")
         learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
-        if hessian == "full":
-            learn.remove("H_f")
         if {"constraints", "terminal_constraints"} & options.keys():
             learn.append("G")
         defaults = {"structure": "tied", "hessian": hessian, "discount_slack": True}
@@ -454,8 +452,7 @@ class QPMPC(nn.Module):
         """
         for name, leaf in self._projected().items():
             dense = self.hessian != "diagonal" and name != "w"
-            n_free = self.layout.n_preview if self.hessian == "full" else self.n_d
-            of_plan = leaf[..., n_free:, n_free:] if dense else leaf[..., None, None]
+            of_plan = leaf[..., self.n_d :, self.n_d :] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
     @serially_if_forked
@@ -476,7 +473,7 @@ class QPMPC(nn.Module):
             if residuals is not None:
                 theta = parameters.moved(self, residuals)
             else:
-                theta = {part: getattr(self, part) for part in parameters.parts(self)}
+                theta = {part: getattr(self, part) for part in (*COST, *CONSTRAINTS)}
             H, q, w = self._cost(theta)
             c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
             if self.layout.blocks:
@@ -704,12 +701,11 @@ class QPMPC(nn.Module):
 
     def _cost(self, theta: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return H, q and w of the QP with the parts ``theta``."""
-        blocks = [theta[name] for name in ("H", "H_f") if name in theta]
 
-        def hessian(*blocks: Tensor) -> Tensor:
-            return self.layout.hessian(self.hessian, blocks, self.discount)
+        def hessian(stages: Tensor, terminal: Tensor) -> Tensor:
+            return self.layout.hessian(self.hessian, stages, terminal, self.discount)
 
-        H = parameters.for_each(hessian, blocks, self._block_ndims)
+        H = parameters.for_each(hessian, [theta["H"], theta["H_f"]], self._block_ndims)
         # A hard row's w is a placeholder, to which its hardness adds inf.
         w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
         return H, self.discount * theta["q"], w

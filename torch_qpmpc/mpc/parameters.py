@@ -121,14 +121,9 @@ def groups(
 def coordinates(module: nn.Module) -> dict[str, Tensor]:
     """Return `QPMPC.coordinates`; H, H_f and w have some only if they are learned."""
     named: dict[str, Tensor] = {}
-    for part in parts(module):
+    for part in (*COST, *CONSTRAINTS):
         named |= _of_part(module, part)
     return named
-
-
-def parts(module: nn.Module) -> list[str]:
-    """Return the names of theta's parts; a full H has no H_f."""
-    return [name for name in (*COST, *CONSTRAINTS) if hasattr(module, name)]
 
 
 def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -136,7 +131,7 @@ def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tenso
     check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
     rest = dict(residuals)
     theta = {}
-    for part in parts(module):
+    for part in (*COST, *CONSTRAINTS):
         before = _of_part(module, part)
         own = {name: rest.pop(name) for name in before if name in rest}
         for name, residual in own.items():

@@ -37,11 +37,10 @@ def parametrizations_for(
     if tied and name in ("q", "b", "lb", "ub", "w"):
         chain.append(Tied(name, layout.ties(name)))
     dense = hessian != "diagonal" and name != "w"
-    n_free = layout.n_preview if hessian == "full" else layout.n_d
     if name in SIGNED and step == CHOLESKY:
-        chain.append(Cholesky(n_free) if dense else SquareRoot())
+        chain.append(Cholesky(layout.n_d) if dense else SquareRoot())
     elif name in ("H", "H_f"):
-        chain.append(Symmetric(n_free) if dense else Support(value))
+        chain.append(Symmetric(layout.n_d) if dense else Support(value))
     if mask is not None and not mask.all():
         _check_mask(name, mask, layout, chain)
         chain.append(Masked(mask, value))

@@ -25,7 +25,7 @@ COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 
 
-def check_learn(learn: Collection[str], structure: str, hessian: str, n_linear: int) -> None:
+def check_learn(learn: Collection[str], structure: str, n_linear: int) -> None:
     """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn."""
     parts = (*COST, *CONSTRAINTS)
     if (
@@ -35,9 +35,6 @@ def check_learn(learn: Collection[str], structure: str, hessian: str, n_linear: 
     ):
         expected = f"a collection of names among {', '.join(parts)}"
         raise QPError.expected("learn", repr(learn), expected)
-    if hessian == "full" and "H_f" in learn:
-        remedy = "A full H contains the terminal block."
-        raise QPError.expected("learn", "'H_f' with hessian='full'", "'H' alone", remedy)
     if "G" in learn and structure != "free" and not n_linear:
         remedy = "Pass constraints, or structure='free'."
         raise QPError.expected("learn", "'G' without constraints", "other parts", remedy)

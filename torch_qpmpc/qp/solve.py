@@ -62,7 +62,8 @@ def solve_qp(
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> qp = qm.QPMPC.of(1, 1, 3, A=[[1.0]], B=[[1.0]], hessian="full").quadratic_program()
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
+        >>> qp = mpc.quadratic_program()
         >>> s = torch.ones(1, dtype=torch.float64, requires_grad=True)
         >>> solution = qm.solve_qp(qp, s, solver="daqp")
         >>> solution.value.backward()

@@ -62,7 +62,7 @@ class TaskSettings(Group):
     gamma: Fraction
     episode_steps: Count
     eval_steps: Count
-    hessian: Literal["diagonal", "block", "full"]
+    hessian: Literal["diagonal", "block"]
     terminal_weight: Literal["default", "identity", "riccati"]
     learn_cost: list[Literal["H", "H_f", "q", "c", "w"]]
     state_slack: Weight
@@ -72,7 +72,7 @@ class TaskSettings(Group):
     @model_validator(mode="after")
     def riccati_is_dense(self) -> Self:
         if self.terminal_weight == "riccati" and self.hessian == "diagonal":
-            remedy = "The Riccati weight needs task.hessian=block or full."
+            remedy = "The Riccati weight needs task.hessian=block."
             raise QPError.expected(
                 "task.terminal_weight", "'riccati'", "default or identity", remedy
             )
