@@ -7,7 +7,6 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
 from torch_qpmpc import QPMPC, GaussNewton
-from torch_qpmpc.mpc import parameters
 
 COST = ("H", "H_f", "q", "c", "w")
 
@@ -101,17 +100,11 @@ class Reference:
         mu = self.damping * (metric * rows.square()).sum(-1).mean()
         matrix, right = rows.mT @ rows, rows.mT @ delta
         matrix += torch.diag(mu / metric)
-        C, mask = parameters.matrix(self.mpc, "C")
-        learned, at = [], 0
+        at = 0
         for leaf in self.leaves:
             part = slice(at, at := at + leaf.numel())
-            own = mask if leaf is C and mask is not None else torch.ones(leaf.numel()).bool()
-            learned.append(own.flatten())
-            if leaf is C and S is not None:
+            if leaf is self.mpc.C and S is not None:
                 D = torch.cat((leaf, self.mpc.b.unsqueeze(-1)), -1).detach()
                 matrix[part, part] += torch.block_diag(*[len(s) * S[:-1, :-1]] * len(leaf))
                 right[part] -= len(s) * (D @ S)[:, :-1].flatten()
-        index = torch.cat(learned).nonzero()[:, 0]
-        step = torch.zeros_like(right)
-        step[index] = torch.linalg.solve(matrix[index][:, index], right[index])
-        return step
+        return torch.linalg.solve(matrix, right)

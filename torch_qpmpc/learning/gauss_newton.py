@@ -32,7 +32,6 @@ from torch_qpmpc.learning.kernel import (
 )
 from torch_qpmpc.learning.td_error import inverse_variance, usable
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import without_gradients
 from torch_qpmpc.qp.derivatives import envelope_gradients
 from torch_qpmpc.qp.program import EVENT_SHAPES
@@ -75,7 +74,8 @@ class StepReport:
 class GaussNewton(torch.optim.Optimizer):
     """A Levenberg-Marquardt optimiser of the learned parts of a `QPMPC`.
 
-    ``lr``, the fraction of each step that is taken, follows torch's schedulers.
+    ``lr``, the fraction of each step that is taken, follows torch's schedulers. Of a part with a
+    mask in the QPMPC's ``learn`` it moves the entries that are learned.
 
     Args:
         mpc: the QPMPC. With ``on_failure="mask"``, pairs without a solution are left out.
@@ -153,15 +153,15 @@ class GaussNewton(torch.optim.Optimizer):
                 The sign is not checked: negate rewards and TorchRL's values.
             penalty: S ``(n_z + 1, n_z + 1)`` of a penalty ``1/2 tr([C, b] S [C, b]')`` added to the
                 batch's mean of ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`;
-                for a free C only, which it moves, and not b.
+                for a free C without a mask only, which it moves, and not b.
             warm_start: active sets of Q(s, a) to start from, ``(B, n_g)``.
 
         Returns:
             The outcome of the step.
 
         Raises:
-            QPError: if a shape does not fit, C is not free but penalised, or the QPMPC has new
-                parameters, as after `QPMPC.release`.
+            QPError: if a shape does not fit, C is penalised but tied or masked, or the QPMPC has
+                new parameters, as after `QPMPC.release`.
         """
         self._check_parameters()
         self._check_batch(s, a, target, penalty)
@@ -224,8 +224,9 @@ class GaussNewton(torch.optim.Optimizer):
             size = mpc.n_z + 1
             check_tensor("penalty", penalty, size, size, batched=False, remedy=remedy)
             if self._free_C() is None:
-                got = "a C that is not free"
-                raise QPError.expected("penalty", got, "C among the learned parts")
+                got = "a C that is tied, masked or frozen"
+                remedy = "In train.py, constraint.si=null omits it."
+                raise QPError.expected("penalty", got, "a free C, learned as a whole", remedy)
 
     def _try(
         self,
@@ -316,8 +317,8 @@ class GaussNewton(torch.optim.Optimizer):
             warnings.warn(str(error), RuntimeWarning, stacklevel=5)
 
     def _free_C(self) -> Tensor | None:
-        """Return the parameter of C if it is learned, free and not frozen."""
-        C, _ = matrix(self._mpc, "C")
+        """Return the parameter of C if all of it is learned, free and not frozen."""
+        C = self._mpc._parameters.get("C")
         leaves = (leaf for group in self.param_groups for leaf in group["params"])
         return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
 
@@ -327,15 +328,16 @@ class GaussNewton(torch.optim.Optimizer):
         chi = root.unsqueeze(-1) * solution.chi[..., : mpc.horizon * mpc.n_x]
         pairs = [(leaf, group) for group in self.param_groups for leaf in group["params"]]
         pairs = [(leaf, group) for leaf, group in pairs if leaf.requires_grad]
-        factored, mask = self._free_C(), matrix(mpc, "C")[1]
-        if factored is not None and mask is not None:
-            factored.copy_(mpc.C)  # another optimiser may have moved entries that are not learned
+        factored = self._free_C()
         dense = [leaf for leaf, _ in pairs if leaf is not factored]
         gradients = iter(_gradients(solution, root, dense, without_C=factored is not None))
         rows, columns = signal_sizes(mpc, self.param_groups[0], z[root > 0])
-        units = {"b": rows, "q": 1 / columns} if mpc.structure == "free" else {}
+        units = {}
+        if mpc.structure == "free":
+            entries = (rows.unsqueeze(-1) / columns).flatten()
+            units = {"C": entries, "b": rows, "q": 1 / columns}
         return [
-            OuterProducts(leaf, group, chi, z, rows, columns, S, mpc.b.detach(), mask)
+            OuterProducts(leaf, group, chi, z, rows, columns, S, mpc.b.detach())
             if leaf is factored
             else Dense(leaf, group, next(gradients).reshape(len(z), -1), units.get(group["name"]))
             for leaf, group in pairs

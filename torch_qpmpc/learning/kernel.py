@@ -85,8 +85,7 @@ class OuterProducts:
     """The gradients ``chi_i z_i'`` in C, with the metric ``scale * rows_i / columns_j``.
 
     The penalty ``1/2 tr([C, b] S [C, b]')`` by itself moves C by ``drift``; with it, the metric of
-    a row is ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each unit of a row. With a ``mask``
-    of the learned entries of C, each pattern of learned entries in a row has its own P.
+    a row is ``rows_i`` times a matrix P ``(n_z, n_z)``, one for each group of rows of one unit.
     Methods as in `Dense`.
     """
 
@@ -100,44 +99,43 @@ class OuterProducts:
         columns: Tensor,
         S: Tensor | None,
         b: Tensor,
-        mask: Tensor | None,
     ) -> None:
         self.leaf, self.group, self.chi, self.z, self.scale = leaf, group, chi, z, 1.0
         self.rows, self.columns, self.S, self.b = rows, columns, S, b.unsqueeze(-1)
         self.drift = torch.zeros_like(leaf)
-        self.patterns = _patterns(mask, None if S is None else rows.unsqueeze(-1))
+        self.groups: list[Any] = [slice(None)]
+        if S is not None:
+            self.groups = [(rows == unit).nonzero()[:, 0] for unit in rows.unique()]
 
     def diagonal(self) -> Tensor:
         chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
-        diagonals = (chi[:, i].sum(-1) * z[:, j].sum(-1) for i, j, _ in self.patterns)
-        return self.scale * sum(diagonals, torch.zeros_like(z[:, 0]))
+        return self.scale * sum(chi[:, i].sum(-1) * z.sum(-1) for i in self.groups)
 
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
-        self.z_P = [self.scale * self.z[:, j] / self.columns[j] for _, j, _ in self.patterns]
+        self.z_P = [self.scale * self.z / self.columns for _ in self.groups]
         if self.S is None:
             return drifted
         force, S = (torch.cat((self.leaf, self.b), -1) @ self.S)[:, :-1], self.S[:-1, :-1]
-        for k, (i, j, entries) in enumerate(self.patterns):
-            z, damping = self.z[:, j], mu / self.rows[i][0]
-            precision = torch.diag(damping / self.scale * self.columns[j]) + S[j][:, j]
+        for k, i in enumerate(self.groups):
+            damping = mu / self.rows[i][0]
+            precision = torch.diag(damping / self.scale * self.columns) + S
             inverse = torch.linalg.inv_ex(precision).inverse
-            drift = -force[entries] @ inverse
-            self.z_P[k], self.drift[entries] = damping * z @ inverse, drift
-            drifted = drifted + ((self.chi[:, i] @ drift) * z).sum(-1)
+            self.z_P[k], self.drift[i] = damping * self.z @ inverse, -force[i] @ inverse
+            drifted = drifted + ((self.chi[:, i] @ self.drift[i]) * self.z).sum(-1)
         return drifted
 
     def kernel(self) -> Tensor:
         K = self.z.new_zeros(len(self.z), len(self.z))
         chi = self.rows * self.chi
-        for (i, j, _), z_P in zip(self.patterns, self.z_P, strict=True):
-            K = K + (chi[:, i] @ self.chi[:, i].mT) * (z_P @ self.z[:, j].mT)
+        for i, z_P in zip(self.groups, self.z_P, strict=True):
+            K = K + (chi[:, i] @ self.chi[:, i].mT) * (z_P @ self.z.mT)
         return K
 
     def step(self, alpha: Tensor) -> Tensor:
         step, chi = self.drift.clone(), alpha.unsqueeze(-1) * self.rows * self.chi
-        for (i, _, entries), z_P in zip(self.patterns, self.z_P, strict=True):
-            step[entries] += chi[:, i].mT @ z_P
+        for i, z_P in zip(self.groups, self.z_P, strict=True):
+            step[i] += chi[:, i].mT @ z_P
         return step
 
     def penalty(self) -> Tensor | float:
@@ -184,25 +182,6 @@ def scale(blocks: Sequence[Block], count: int) -> None:
         name = block.group["name"]
         size = max(sizes[name] if name in COST else model, least)
         block.scale = block.group["scale"] / (size or 1.0)
-
-
-def _patterns(mask: Tensor | None, kinds: Tensor | None) -> list[tuple[Any, Any, Any]]:
-    """Group the rows of C by learned entries and by ``kinds`` ``(n_c, 1)``, if these are not None.
-
-    Return the rows, the columns, and the index in C of each group.
-    """
-    keys = [key for key in (mask, kinds) if key is not None]
-    if not keys:
-        return [(slice(None), slice(None), (slice(None), slice(None)))]
-    kind = torch.unique(torch.cat(keys, dim=-1), dim=0, return_inverse=True)[1]
-    groups: list[tuple[Any, Any, Any]] = []
-    for k in kind.unique():
-        i = (kind == k).nonzero()[:, 0]
-        if mask is None:
-            groups.append((i, slice(None), (i, slice(None))))
-        elif len(j := mask[i[0]].nonzero()[:, 0]):
-            groups.append((i, j, (i.unsqueeze(-1), j)))
-    return groups
 
 
 def damping_of(blocks: Sequence[Block], damping: float) -> Tensor:

@@ -118,7 +118,7 @@ def second_order(
 
 def entries_of_C(mpc: QPMPC) -> Tensor:
     """Return C, or its parameter if only some of its entries are learned."""
-    parameter, _ = matrix(mpc, "C")
+    parameter = matrix(mpc, "C")
     return mpc.C if parameter is None else parameter
 
 

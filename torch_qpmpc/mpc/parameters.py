@@ -64,18 +64,16 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
 
 
-def matrix(module: nn.Module, name: str) -> tuple[nn.Parameter | None, Tensor | None]:
-    """Return the parameter with the entries of a part, and the mask of those that are learned.
+def matrix(module: nn.Module, name: str) -> nn.Parameter | None:
+    """Return the parameter with the entries of a part, all or masked.
 
-    The parameter is None if the part is computed from others, or is not learned; the mask is None
-    if all entries are learned.
+    It is None if the part is computed from others, or is not learned.
     """
     if not parametrize.is_parametrized(module, name):
-        return module._parameters.get(name), None
+        return module._parameters.get(name)
     own = list(module.get_submodule(f"parametrizations.{name}").children())
-    if len(own) == 1 and isinstance(own[0], Masked):
-        return leaves(module, name)[0], own[0].mask
-    return None, None
+    masked = len(own) == 1 and isinstance(own[0], Masked)
+    return leaves(module, name)[0] if masked else None
 
 
 def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
