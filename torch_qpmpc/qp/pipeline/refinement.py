@@ -37,7 +37,7 @@ SINGULAR = 2e-15
 #: .. and H is flat in a direction whose curvature is, relative to its largest entry.
 FLAT = 1e-14
 #: A z this many times as large as that of least norm is not a start.
-RUNAWAY = 1e6
+RUNAWAY = 1e3
 #: A row this close to its bound, relatively, may be active at a vertex.
 NEAR = 1e-6
 #: Splits a number into two halves of 26 bits.

@@ -105,7 +105,7 @@ class BatchedQPs:
         near = lower.abs().minimum(upper.abs()) / size
         near = near.masked_fill(~((near > 0) & (near < 1e-10 * HUGE)), torch.nan)
         near = near.nanmedian(-1, keepdim=True).values.nan_to_num(1.0)
-        near = near.maximum(_largest(g) / stiffest).nan_to_num(HUGE)
+        near = near.maximum((_largest(g) / stiffest).nan_to_num(0.0, 0.0))
         far = FAR * size * near
         lower, upper = lower.where(lower >= -far, -HUGE), upper.where(upper <= far, HUGE)
         width = (upper - lower) / size
@@ -362,7 +362,8 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     D = ratio.sum(1).reciprocal_().minimum(qps.penalty.unsqueeze(1))
     factor = qps.factor(D.sum(1) + hold)
     short = point.level - y
-    right = qps.apply_Gt(hold * short - point.lam) - qps.apply_H(v) - qps.g
+    pull = DAMPING * qps.curvature.unsqueeze(-1) * v
+    right = qps.apply_Gt(hold * short - point.lam) - qps.apply_H(v) - qps.g - pull
     room = point.bound - y.unsqueeze(1)
 
     def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
