@@ -469,6 +469,7 @@ def hopeless_plant(draw: Draw, count: int) -> Case:
     # x_0 itself is within wider ones.
     bound[:, :n_x] = torch.inf
     data = {
+        "G": torch.eye(n_z).double(),
         "b": torch.zeros(len(plant.C)).double(),
         "lb": -bound,
         "ub": bound,

@@ -307,6 +307,20 @@ def test_rows_that_disagree_leave_the_error_without_a_bound():
     assert bounded_by_both(54.5 + 1e-11).value_error.item() == torch.inf
 
 
+@pytest.mark.parametrize(("noise", "bounded"), [(1e-12, True), (1e-9, False)])
+def test_rows_that_agree_up_to_the_rounding_of_a_thin_angle_bound_the_error(noise, bounded):
+    """Two rows at an angle of 1e-3 fix a vertex to a thousand times their own rounding."""
+    one, none = torch.eye(2).double(), torch.zeros(2).double()
+    G = torch.tensor([[1.0, 0.0], [1.0, 1e-3], [0.6, 0.8]]).double()
+    ub, inf = G.sum(1), torch.full((3,), torch.inf).double()
+    ub[2] -= noise
+    lam = torch.tensor([[0.0, 0.0, 1.0]]).double()
+    data = (one, -1 - G[2], none[0], one[:0], none[:0], G, -inf, ub, inf, none[:0])
+    z, nothing = torch.ones(1, 2).double(), torch.zeros(1, 0).double()
+    certificate = certify(Programs.of(*data)[0], z, lam, nothing, nothing)
+    assert (certificate.value_error.item() < 1e-6) == bounded
+
+
 # Each judge of the same rows
 
 

@@ -184,6 +184,7 @@ def test_small_curvature_is_not_unbounded(curvature):
         ("unbounded", 16, 42, 5),  # a slope of 1 on curvatures of 1 and 0
         ("unbounded", 16, 74, 6),
         ("scaled mixed", 16, 108, 4),
+        ("hopeless plant", 16, 6, 0),  # the least z with C z = b is 1e8 times as far as the bounds
     ],
 )
 def test_qps_formerly_not_converged_have_their_proof(family, count, seed, index):

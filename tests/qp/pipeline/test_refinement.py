@@ -14,10 +14,11 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.campaign.families import Case, Draw, parallel_rows
+from tests.campaign.families import FAMILIES, Case, Draw, parallel_rows
 from tests.problems import known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.pipeline import refinement
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.refinement import products, refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
@@ -64,6 +65,36 @@ def test_a_flat_direction_has_its_solution_of_least_norm(solver, case):
     solution = solve_qp(qp, data["fixed"], solver=solver)
     assert_close(solution.value, data["value"], rtol=1e-9, atol=0)
     assert solution.z.abs().max() < 2
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_solution_that_ran_along_a_flat_direction_comes_back(held):
+    """At 1e5 times its length, the rounding of H alone is worth more than the tolerance.
+
+    ``held``: a row has its far bound there, with a multiplier of rounding size.
+    """
+    inf, rng = np.inf, np.random.default_rng(0)
+    factor = rng.normal(size=(3, 6))
+    G, z = rng.normal(size=(2, 6)), rng.normal(size=6)
+    lam = np.array([1.0, 1e-14 if held else 0.0])
+    far = 1e5 * np.linalg.svd(np.vstack((factor, G[:1])))[2][-1]
+    ub = np.array([G[0] @ z, G[1] @ (z + far) if G[1] @ far > 0 else inf])
+    q = -factor.T @ factor @ z - G[0]
+    data = {"H": factor.T @ factor, "q": q, "c": 0.0, "C": np.zeros((0, 6)), "b": []}
+    data |= {"G": G * [[1], [np.sign(G[1] @ far)]], "lb": [-inf] * 2, "ub": ub, "w": [inf] * 2}
+    parts: Any = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
+    p, _ = Programs.of(*QuadraticProgram(**parts).tensors(), torch.zeros(1, 0))
+    ran = p.unsolved(0)._replace(z=(z + far)[None], lam=lam[None])
+    refine(p, ran, np.arange(1))
+    assert ran.value_error.item() < 1e-12
+    assert np.abs(ran.z).max() < 10
+
+
+def test_a_batch_is_refined_from_its_smallest_residuals():
+    """Errors of the value are infinite for rows that agree up to a solver's tolerance."""
+    case = FAMILIES["previews"](Draw(0), 128)
+    solution = solve_qp(case.known.qp, case.known.fixed, solver="daqp", on_failure="mask")
+    assert (solution.status == 0).all()
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-150, 1e150])

@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import known_qp, soft_qps
+from tests.campaign.families import Draw, zero_H
+from tests.problems import known_qp, programs_of, soft_qps
 from torch_qpmpc import QPMPC, SolveLog
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.solvers import BackendSolution, interior_point
@@ -84,6 +85,14 @@ def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
     reference = mpc.solve(s, a if kind == "Q" else None)
     difference = (solution.value - reference.value).abs() / (1 + reference.value.abs())
     assert (difference <= reference.residual.clamp(min=1e-8)).all()
+
+
+@pytest.mark.parametrize("seed", [1001, 2002])
+def test_linear_programs_with_bounds_that_are_far_away(seed):
+    """Bounds of 1e3 to 1e20 beside others: no length follows from a cost without curvature."""
+    programs = programs_of(zero_H(Draw(seed), 128).known).scaled()
+    answer = programs.recover(programs.reduced_qps().solved_by(interior_point.solve))
+    assert answer.accepted().all()
 
 
 def test_multipliers_of_inactive_rows_are_zero():

@@ -425,7 +425,7 @@ def _repair(rows, hard, z, G, units, basis, ends, slacks):
         if norm > DEPENDENT:
             for e in range(len(basis[k])):
                 basis[k, e] /= norm
-            ends[k], slacks[k] = part / norm, slack
+            ends[k], slacks[k] = part / norm, slack / norm
             total += ends[k] ** 2
             k += 1
         elif abs(part) > slack + DEPENDENT * math.sqrt(total):

@@ -156,18 +156,17 @@ class BatchSolution(NamedTuple):
         for own, new in zip(self, others, strict=True):
             own[index] = new
 
-    def error(self) -> Array:
-        """Return the larger of the residual and the value's error, ``(B,)``."""
-        return np.maximum(self.residual, self.value_error)
-
     def proved(self) -> Array:
         """Return the mask of QPs that are proved to have no solution, ``(B,)``."""
         return (self.status == Status.INFEASIBLE) | (self.status == Status.UNBOUNDED)
 
     def improve(self, index: np.ndarray, others: BatchSolution) -> None:
-        """Replace solutions by others with a proof or with smaller errors, at ``index``."""
-        nothing = ~(self.residual[index] < np.inf) & (others.residual < np.inf)
-        better = others.proved() | nothing | (others.error() < self.error()[index])
+        """Replace solutions that are not accepted, at ``index``, by others that are better.
+
+        Those have a proof, are accepted, or have a smaller residual, which is what a refinement
+        starts from: an infinite error of the value may be due to rounding alone.
+        """
+        better = others.proved() | others.accepted() | (others.residual < self.residual[index])
         better = np.flatnonzero(better)
         self.put(index[better], others.at(better))
 

@@ -153,7 +153,8 @@ def _contradict(
 ) -> bool:
     """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible.
 
-    Not even one that violates each row by the fraction `CONTRADICTED` of its terms at ``z``.
+    Not even one that violates each row by the fraction `CONTRADICTED` of its terms at ``z``, of
+    whose entries none counts as larger than the hard rows allow.
     """
     G_lam = qp.G.T @ lam
     for _ in range(3):
@@ -166,9 +167,10 @@ def _contradict(
         charge = np.where(up > 0, up * qp.ub, 0) - np.where(down > 0, down * qp.lb, 0)
         terms = np.where(up > 0, up * qp.ub_size, 0) + np.where(down > 0, down * qp.lb_size, 0)
     terms = terms.sum() + qp.b_size @ size
-    terms += np.abs(z) @ (np.abs(qp.G).T @ np.abs(lam) + np.abs(qp.C).T @ size)
     residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
-    zero = residual <= ROUNDING * (np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down))
+    of_z = np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down)
+    terms += np.minimum(np.abs(z), reach) @ of_z
+    zero = residual <= ROUNDING * of_z
     # The residual is charged at the largest |z| that the hard rows allow.
     excess = (residual * np.where(zero, 0, reach)).sum()
     demand = qp.b @ chi + charge.sum() + excess

@@ -40,6 +40,8 @@ FLAT = 1e-14
 RUNAWAY = 1e3
 #: A row this close to its bound, relatively, may be active at a vertex.
 NEAR = 1e-6
+#: A multiplier is zero up to rounding if its force is this small, relative to the largest.
+WEAK = 1e-10
 #: Splits a number into two halves of 26 bits.
 SPLIT = 134217729.0
 TINY = np.finfo(float).tiny
@@ -134,7 +136,7 @@ class _QP(NamedTuple):
         share = force / max(force.max(initial=0.0), TINY)
         bound, sign = np.where(lam > 0, self.ub, self.lb), np.sign(lam)
         beyond = sign * (self.G @ z - bound) / np.maximum(self.row_sizes(z), TINY)
-        held = ((lam != 0) & (share > np.abs(beyond))) | ((self.lb == self.ub) & (self.w > 0))
+        held = (share > np.maximum(np.abs(beyond), WEAK)) | ((self.lb == self.ub) & (self.w > 0))
         below = 1 - np.abs(lam) / np.maximum(self.w, TINY)
         saturated = (self.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
         code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
