@@ -215,6 +215,23 @@ def solution_of(known: KnownQP) -> dict[str, Tensor]:
     return {name: getattr(known, name) for name in names}
 
 
+def drawn_mpc(
+    n_x: int, n_u: int, horizon: int, n_d: int = 0, *, seed: int = 0, **options: Any
+) -> QPMPC:
+    """Make a QPMPC of these sizes whose model and weights of states are drawn."""
+    kind: dict[str, Any] = {"dtype": torch.float32, "device": "cpu"}
+    drawing = {"generator": torch.Generator().manual_seed(seed), **kind}
+    noise, B = (torch.randn(n_x, n, **drawing) for n in (n_x, n_u))
+    weights = 0.5 + 4.5 * torch.rand(n_x, **drawing)
+    drawn = {
+        "A": torch.eye(n_x, **kind) + 0.1 * noise,
+        "B": 0.1 * B,
+        "stage_weight": torch.cat((weights, torch.zeros(n_u, **kind))),
+        "terminal_weight": [1.0] * n_x,
+    }
+    return QPMPC.of(n_x, n_u, horizon, n_d, **(drawn | options))
+
+
 def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options: Any) -> QPMPC:
     """Make a bounded QPMPC of two states and one action; shift theta by up to ``free``."""
     settings: dict[str, Any] = {
@@ -224,7 +241,7 @@ def random_mpc(seed: int = 0, *, free: float = 0.1, horizon: int = 3, **options:
         "terminal_weight": [1.0, 1.0],
         "solver": "daqp",
     }
-    mpc = QPMPC.of(2, 1, horizon, seed=seed, **(settings | options))
+    mpc = drawn_mpc(2, 1, horizon, seed=seed, **(settings | options))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in mpc.parameters():

@@ -27,7 +27,7 @@ def test_a_qp_a_controller_and_the_ids_import_nothing_heavy():
         "import gymnasium, torch, torch_qpmpc\n"
         "from torch_qpmpc import QPMPC, solve_qp\n"
         "gymnasium.spec('torch_qpmpc/PointMass-v0')\n"
-        "QPMPC.of(2, 1, 3).value(torch.ones(2))\n"
+        "QPMPC.from_model([[1]], [[1]], 3, stage_weight=[1, 1]).value(torch.ones(1))\n"
         "mpc = torch_qpmpc.LinearMPC(([[0.9]], [[0.5]]), 3, Q=1.0)\n"
         "torch_qpmpc.Controller(mpc).step([0.0], [1.0])"
     )

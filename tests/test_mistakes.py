@@ -74,6 +74,7 @@ def Q(**changes: Any) -> Callable[[], Any]:
 
 def M(**changes: Any) -> Callable[[], Any]:
     base = {"n_x": 2, "n_u": 1, "horizon": 3, "A": eye(2), "B": ones(2, 1)}
+    base["stage_weight"] = [1.0, 1.0, 0.1]
     return lambda: qm.QPMPC.of(**(base | changes))
 
 
@@ -121,7 +122,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("A: got [[1.0, 0.0], [1.0]], expected a tensor, or what", M(A=[[1.0, 0.0], [1.0]])),
     ("A: got a torch.sparse_coo tensor, which is sparse, expected a", M(A=eye(2).to_sparse())),
     ("B: got csr_array, which is sparse, expected a", M(B=scipy.sparse.csr_array(np.ones((2, 1))))),
-    ("seed: got 9223372036854775808, expected a whole number >= 0 and < 2^63.", M(seed=2**63)),
     ("state_slack: got 'inf', expected a non-negative weight, or inf for", M(state_slack="inf")),
     ("discount_slack: got 'no', expected True or False.", M(discount_slack="no")),
     ("learn: got None, expected a collection of names among H, H_f, q, c, w, C, b", M(learn=None)),
@@ -131,7 +131,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("constraints: got ([[1.0, 0, 0]], [1.0]), expected", M(constraints=([[1.0, 0, 0]], [1.0]))),
     ("constraints, bounds: got shape (2,)", M(constraints=([[1.0, 0, 0]], [0.0, 0.0], [1.0, 1.0]))),
     ("stage_weight: got smallest eigenvalue -1", lambda: LTI(3, stage_weight=[-1.0, -1.0, -0.1])),
-    ("A: got None, expected a tensor, or what", lambda: qm.QPMPC.from_model(None, None, 3)),
+    ("A: got None, expected a matrix of x+ = A", lambda: qm.QPMPC.from_model(None, None, 3)),
     ("s: got a tensor on meta, expected one on cpu. Move it, or", lambda: mpc.value(S.to("meta"))),
     ("s: got shape (4, 1), expected shape (*batch, 2).", lambda: mpc.action_value(Aa, S)),
     ("a: got shape (3, 1), expected leading", lambda: mpc.action_value(zeros(4, 2), zeros(3, 1))),

@@ -17,6 +17,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 import train
+from tests.problems import drawn_mpc
 from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPMPC, QPError, export_c
 from torch_qpmpc.experiment.config import settings
@@ -216,7 +217,7 @@ def test_files_are_written_beside_their_links_targets(tmp_path):
     for name in ("file", "file.partial", "policy.c", "policy.h", "mine.qpmpc"):
         (tmp_path / name).symlink_to(outside)
     write_whole(tmp_path / "file", b"ours")
-    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
+    mpc = drawn_mpc(1, 1, 2, stage_weight=[1.0, 1.0])
     mpc.save(tmp_path / "mine.qpmpc")
     export_c(mpc, tmp_path)
     assert outside.read_text() == "mine"

@@ -10,8 +10,8 @@ import torch
 from torch.testing import assert_close
 
 from tests.figures import image_of, legend_of, make_mpc, rendered
-from tests.problems import normal
-from torch_qpmpc import QPMPC, QPError
+from tests.problems import drawn_mpc, normal
+from torch_qpmpc import QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,
     episode_figure,
@@ -64,7 +64,7 @@ def test_an_episode_has_a_panel_for_each_signal():
 
 
 def test_plans_are_those_of_the_qp():
-    mpc = QPMPC.of(N_Y, N_U, 3, n_d=1, solver="daqp")
+    mpc = drawn_mpc(N_Y, N_U, 3, n_d=1, solver="daqp")
     p = normal(T, mpc.n_p)
     plans = plans_along(mpc, p, every=4)
     assert [*plans] == [0, 4]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from tests.figures import image_of, rendered
-from tests.problems import model_form, normal, predict
+from tests.problems import drawn_mpc, model_form, normal, predict
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError
 from torch_qpmpc.analysis.plots import canonical_figure
 from torch_qpmpc.analysis.policy import local_gain
@@ -163,7 +163,7 @@ def test_the_band_of_a_preview():
         ]
     )
     weights = {"c_1": a, "c_2": o, "c_3": b}
-    mpc = QPMPC.of(1, 1, 3, n_d=1)
+    mpc = drawn_mpc(1, 1, 3, n_d=1)
     assert torch.equal(DeviationPenalty(mpc, **weights).C_mask, expected.double())
     with torch.no_grad():
         mpc.C += torch.arange(33).view(3, 11)

@@ -10,8 +10,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from tests.problems import model_form, normal
-from torch_qpmpc import QPMPC
+from tests.problems import drawn_mpc, model_form, normal
 from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.structure import (
     NearestModel,
@@ -36,7 +35,7 @@ C = C_0 + torch.randn(C_0.shape, generator=generator, dtype=torch.float64)
 
 
 def test_distances_are_the_blocks_sums():
-    mpc = QPMPC.of(N_X, N_U, N, A=A, B=B, structure="free")
+    mpc = drawn_mpc(N_X, N_U, N, A=A, B=B, structure="free")
     with torch.no_grad():
         mpc.C += C - C_0
     expected = {"on": 0.0, "above": 0.0, "below": 0.0}

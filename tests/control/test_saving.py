@@ -10,6 +10,7 @@ import torch
 
 import torch_qpmpc as qm
 from tests.control.controllers import A, B, C, learned
+from tests.problems import drawn_mpc
 from torch_qpmpc import QPError, files
 
 FOLDER = Path(__file__).parent
@@ -91,7 +92,7 @@ def test_files_of_other_kinds_are_named(tmp_path):
     mpc = learned()
     qm.Controller(mpc).save(tmp_path / "controller")
     mpc.save(tmp_path / "mpc")
-    qm.QPMPC.of(1, 1, 2).save(tmp_path / "qp")
+    drawn_mpc(1, 1, 2).save(tmp_path / "qp")
     with pytest.raises(QPError, match=r"controller, a saved Controller, expected a file that QPM"):
         qm.QPMPC.load(tmp_path / "controller")
     with pytest.raises(QPError, match=r"that LinearMPC.save wrote. Controller.load reads it"):

@@ -20,6 +20,7 @@ from tests.exported import (
     rates,
     tied,
 )
+from tests.problems import drawn_mpc
 from torch_qpmpc import QPMPC, Status, export_c
 from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.export.library import compiler
@@ -127,7 +128,7 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
 
 
 def test_a_qp_without_rows_has_a_linear_policy(tmp_path):
-    mpc = QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
+    mpc = drawn_mpc(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
     library, tables = load(mpc, tmp_path, flags=("-O2", *STRICT))
     assert len(tables.rows) == 0
     p = draw_known(mpc, 50)

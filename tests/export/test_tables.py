@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tests.exported import SCHEMES, random_qp
-from torch_qpmpc import QPMPC, QPError
+from tests.problems import drawn_mpc
+from torch_qpmpc import QPError
 from torch_qpmpc.export.tables import make_tables
 
 
@@ -21,7 +22,7 @@ def test_rows_have_unit_norm_and_depend_on_the_variables_only(seed):
 
 
 def test_a_cost_that_is_singular_on_the_plan_is_refused():
-    mpc = QPMPC.of(1, 2, 3, B=[[1.0, 1.0]], stage_weight=[1.0, 0.0, 0.0])
+    mpc = drawn_mpc(1, 2, 3, B=[[1.0, 1.0]], stage_weight=[1.0, 0.0, 0.0])
     match = r"H: got eigenvalues from .*, expected a cost that is positive definite.*Add a small"
     with pytest.raises(QPError, match=match):
         make_tables(mpc)
@@ -29,7 +30,7 @@ def test_a_cost_that_is_singular_on_the_plan_is_refused():
 
 @pytest.mark.parametrize("part", ["q", "C", "b", "lb"])
 def test_a_theta_with_nan_is_refused(part):
-    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
+    mpc = drawn_mpc(1, 1, 2, stage_weight=[1.0, 1.0])
     with torch.no_grad():
         getattr(mpc, part).fill_(torch.nan)
     match = f"{part}: got NaN or inf, expected a finite theta. Export a theta that mpc.value"
@@ -38,7 +39,7 @@ def test_a_theta_with_nan_is_refused(part):
 
 
 def test_crossed_bounds_are_refused():
-    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0], action_bounds=([-1.0], [1.0]))
+    mpc = drawn_mpc(1, 1, 2, stage_weight=[1.0, 1.0], action_bounds=([-1.0], [1.0]))
     mpc.lb[1] = 2.0
     with pytest.raises(QPError, match="lb: got entries above ub, expected lb <= ub in every row"):
         make_tables(mpc)
@@ -48,7 +49,7 @@ def test_the_action_bounds_are_those_of_hard_rows_with_one_action():
     tables = make_tables(SCHEMES["rates"]())
     np.testing.assert_array_equal(tables.u_lower, [-1])
     np.testing.assert_array_equal(tables.u_upper, [1])
-    soft = QPMPC.of(
+    soft = drawn_mpc(
         1, 1, 2, stage_weight=[1.0, 1.0], action_bounds=([-1.0], [1.0]), action_slack=2.0
     )
     np.testing.assert_array_equal(make_tables(soft).u_upper, [np.inf])

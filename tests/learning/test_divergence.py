@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import train
+from tests.problems import drawn_mpc
 from tests.runs import SMALL, make_config
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, GaussNewton
@@ -44,7 +45,7 @@ def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer
 
 @pytest.mark.parametrize("trust_region", [True, False])
 def test_gauss_newton_takes_no_step_that_is_not_finite(trust_region):
-    mpc = QPMPC.of(2, 1, 3, solver="daqp")
+    mpc = drawn_mpc(2, 1, 3, solver="daqp")
     optimizer = GaussNewton(mpc, trust_region=trust_region)
     before = {name: value.clone() for name, value in mpc.state_dict().items()}
     s, a = torch.ones(2, 2).double(), torch.zeros(2, 1).double()
@@ -70,7 +71,7 @@ class Steep(torch.nn.Module):
 
 
 def test_a_gradient_that_is_not_finite_moves_nothing():
-    mpc = QPMPC.of(2, 1, 3, learn=["C"], solver="daqp")
+    mpc = drawn_mpc(2, 1, 3, learn=["C"], solver="daqp")
     optimizer = torch.optim.SGD(mpc.parameter_groups({"cost": 1.0, "constraints": 1.0}))
     before = mpc.C.detach().clone()
     update = first_order(mpc, Steep(mpc), optimizer, None, None)  # pyright: ignore[reportArgumentType] -- what is used of a loss is there

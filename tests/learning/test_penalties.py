@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.problems import drawn_mpc
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError, SystemIdentificationPenalty
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.mpc.layout import banded_matrix
@@ -28,7 +29,7 @@ def normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
 
 def make_mpc(generator: torch.Generator) -> QPMPC:
     A, B = normal(generator, N_X, N_X), normal(generator, N_X, N_U)
-    return QPMPC.of(N_X, N_U, N, A=A, B=B)
+    return drawn_mpc(N_X, N_U, N, A=A, B=B)
 
 
 # --- Deviation -----------------------------------------------------------------------------------
@@ -38,13 +39,13 @@ def test_mask_is_the_printed_one():
     """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
     a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
     scalar = torch.tensor([[o, o, o, a, a, a, a], [b, b, o, o, o, a, a], [b, b, b, b, o, o, o]])
-    penalty = DeviationPenalty(QPMPC.of(1, 1, 3), c_1=a, c_2=o, c_3=b)
+    penalty = DeviationPenalty(drawn_mpc(1, 1, 3), c_1=a, c_2=o, c_3=b)
     assert torch.equal(penalty.C_mask, scalar)
 
     n_x, n_u = 4, 2
     widths = torch.tensor([n_x, n_u] * 3 + [n_x])
     blocks = scalar.repeat_interleave(n_x, dim=0).repeat_interleave(widths, dim=1)
-    penalty = DeviationPenalty(QPMPC.of(n_x, n_u, 3), c_1=a, c_2=o, c_3=b)
+    penalty = DeviationPenalty(drawn_mpc(n_x, n_u, 3), c_1=a, c_2=o, c_3=b)
     assert torch.equal(penalty.C_mask, blocks)
 
 
@@ -123,7 +124,7 @@ def test_proximal_step_reaches_C_0_exactly(generator):
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
 def test_impossible_deviation_weights(name, weight):
     with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):
-        DeviationPenalty(QPMPC.of(1, 1, 3), **{name: weight})
+        DeviationPenalty(drawn_mpc(1, 1, 3), **{name: weight})
 
 
 # --- System identification -----------------------------------------------------------------------

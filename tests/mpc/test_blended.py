@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
+from tests.problems import drawn_mpc
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.analysis.report import read
 from torch_qpmpc.export.export import export_c
@@ -230,15 +231,15 @@ def test_an_empty_batch_has_no_values(model):
             "trajectories: got known signals d, expected outputs and actions only",
         ),
         (
-            lambda log: QPMPC.of(3, 1, N, schedule=qm.identify_blended(log, 3, centres=2)),
+            lambda log: drawn_mpc(3, 1, N, schedule=qm.identify_blended(log, 3, centres=2)),
             "schedule: got n_x, n_u, n_d = .2, 1, 0., exp.* = .3, 1, 0., as the QPMPC",
         ),
         (
-            lambda _: QPMPC.of(2, 1, N, schedule=1),
+            lambda _: drawn_mpc(2, 1, N, schedule=1),
             "schedule: got 1, expected a BlendedModel, or its",
         ),
         (
-            lambda _: QPMPC.of(2, 1, N, schedule={"A": 1}),
+            lambda _: drawn_mpc(2, 1, N, schedule={"A": 1}),
             "schedule: got keys A, expected a Blended",
         ),
         (

@@ -17,7 +17,7 @@ def test_rows_are_hard_or_have_a_price():
     )
     scheme = Scheme(Layout(2, 1, horizon=1), bounds=bounds)
     assert (scheme.layout.n_mixed, scheme.layout.n_terminal) == (1, 0)
-    theta = scheme.theta
+    theta = bounds.rows(scheme.layout)
     assert theta["ub"].tolist() == [1, 2, 3, 1, 2, 4]
     assert theta["lb"].tolist() == [-1, -2, -3, -1, -2, 0]
     assert theta["w"].tolist() == [7, torch.inf, torch.inf, 7, torch.inf, 100]
@@ -31,7 +31,7 @@ def test_each_row_of_D_and_D_f_may_have_its_own_price():
         terminal_constraints=([[1.0]], [-1.0], [1.0]),
         constraint_slack=[2.0, torch.inf, 3.0],
     )
-    w = Scheme(Layout(1, 1, horizon=2), bounds=bounds).theta["w"]
+    w = bounds.rows(Scheme(Layout(1, 1, horizon=2), bounds=bounds).layout)["w"]
     assert w[5:].tolist() == [2, torch.inf, 2, torch.inf, 3]
 
 

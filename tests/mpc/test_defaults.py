@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
-import pickle
-import warnings
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
-from torch.func import vmap
 from torch.testing import assert_close
 
 from tests.logs import arx_log
@@ -100,30 +96,3 @@ def test_from_data_fits_the_cost_to_the_rewards(hessian):
     own = QPMPC.from_data(log, 3, stage_weight=[1.0, 1.0, 0.1])
     assert own.H.tolist() == [1.0, 1.0, 0.1]
     assert (own.q == 0).all()
-
-
-def test_a_random_start_warns_once_when_its_policy_acts():
-    assert "at random" in (QPMPC.of.__doc__ or "").splitlines()[0]
-    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mpc.value(s)
-        mpc.action_value(s, torch.zeros(4, 1))
-    with pytest.warns(UserWarning, match="random model or stage cost, .* Pass A, B and stage_weig"):
-        mpc.policy(s)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mpc.policy(s)
-        vmap(mpc.policy)(s)
-        for twin in (copy.copy(mpc), copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
-            twin.policy(s)
-        loaded = QPMPC.of(2, 1, 3, seed=1)
-        loaded.load_state_dict(mpc.state_dict())
-        loaded.policy_and_active_set(s)
-        QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1]).policy(s)
-
-
-def test_a_random_start_compiles():
-    mpc, s = QPMPC.of(2, 1, 3), torch.ones(4, 2)
-    compiled = torch.compile(mpc.policy, backend="eager", fullgraph=True)
-    assert_close(compiled(s), mpc.policy(s))

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from torch_qpmpc import Layout, Model, QPError, Scheme
+from torch_qpmpc import Cost, Layout, Model, QPError, Scheme
 
 A, B = torch.eye(2), torch.ones(2, 1)
 
@@ -51,7 +51,7 @@ def test_bad_arguments_are_named(arguments, message):
 @pytest.mark.parametrize("name", ["A", "B"])
 def test_a_model_without_matrices_has_no_sizes(name):
     matrices: dict[str, Any] = {"A": A, "B": B} | {name: None}
-    with pytest.raises(QPError, match=f"{name}: got None, expected a matrix. Or pass a Layout"):
+    with pytest.raises(QPError, match=f"{name}: got None, expected a matrix of x"):
         Model(**matrices).layout(3)
 
 
@@ -60,10 +60,10 @@ def test_a_model_without_matrices_has_no_sizes(name):
     [
         (Model(torch.eye(3), torch.ones(3, 1)), r"A, B: got .* expected \(2, 2\) and \(2, 1\)"),
         (Model(A, torch.ones(2, 2, 1)), r"B: got shape \(2, 2, 1\), expected .* or \(3, 2, 1\)"),
-        (Model(offset=[1.0]), r"offset: got shape \(1,\), expected shape \(2,\)"),
-        (Model(C=torch.ones(6, 10)), r"C: got shape \(6, 10\), expected shape \(6, 11\)"),
+        (Model(A, B, offset=[1.0]), r"offset: got shape \(1,\), expected shape \(2,\)"),
+        (Model(A, B, C=torch.ones(6, 10)), r"C: got shape \(6, 10\), expected shape \(6, 11\)"),
     ],
 )
 def test_a_scheme_refuses_a_model_of_other_sizes(model, message):
     with pytest.raises(QPError, match=message):
-        Scheme(Layout(2, 1, 3), model)
+        Scheme(Layout(2, 1, 3), model, Cost([1.0, 1.0, 0.1]))

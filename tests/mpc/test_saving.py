@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.problems import drawn_mpc
 from torch_qpmpc import QPMPC, QPError, SolverError, files
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -48,7 +49,7 @@ def test_later_releases_read_the_first_format():
 
 
 def test_a_parametrization_of_the_users_is_refused(tmp_path):
-    mpc = QPMPC.of(1, 1, 2, stage_weight=[1.0, 1.0])
+    mpc = drawn_mpc(1, 1, 2, stage_weight=[1.0, 1.0])
     torch.nn.utils.parametrize.register_parametrization(mpc, "C", torch.nn.Identity())
     with pytest.raises(QPError, match=r"^save: got a parametrization of C that is not QPMPC"):
         mpc.save(tmp_path / "file")
@@ -77,7 +78,7 @@ def test_another_file_is_named(tmp_path):
 
 
 def test_a_file_without_a_part_is_named(tmp_path):
-    QPMPC.of(1, 1, 2).save(tmp_path / "file")
+    drawn_mpc(1, 1, 2).save(tmp_path / "file")
     content = torch.load(tmp_path / "file")
     del content["mpc"]["q"]
     torch.save(content, tmp_path / "file")
@@ -87,7 +88,7 @@ def test_a_file_without_a_part_is_named(tmp_path):
 
 def test_a_file_with_a_backend_that_is_not_registered_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(BACKENDS, "mine", BACKENDS["daqp"])
-    QPMPC.of(1, 1, 2, solver="mine").save(tmp_path / "file")
+    drawn_mpc(1, 1, 2, solver="mine").save(tmp_path / "file")
     monkeypatch.delitem(BACKENDS, "mine")
     with pytest.raises(QPError, match=r"solver: got 'mine'.* Register the backend of that name"):
         QPMPC.load(tmp_path / "file")
@@ -109,7 +110,7 @@ def test_it_is_the_policy_as_an_array(dtype, batch):
 @pytest.mark.parametrize("observation", [np.ones(3), 1.0, np.ones((2, 1))])
 def test_another_shape_is_an_error(observation):
     with pytest.raises(QPError, match=r"^observation: got shape \(.*\), expected shape \(\*batch"):
-        QPMPC.of(2, 1, 3).predict(observation)
+        drawn_mpc(2, 1, 3).predict(observation)
 
 
 @pytest.mark.parametrize("observation", [(np.ones(2), {}), {"observation": np.ones(2)}])
@@ -118,12 +119,12 @@ def test_more_than_an_observation_is_an_error(observation):
         rf"^observation: got {type(observation).__name__}, .* \(\.\., 2\)\. Pass the observation"
     )
     with pytest.raises(QPError, match=message):
-        QPMPC.of(2, 1, 3).predict(observation)
+        drawn_mpc(2, 1, 3).predict(observation)
 
 
 def test_nan_is_an_error():
     with pytest.raises(QPError, match=r"^observation: got NaN or inf, expected finite numbers"):
-        QPMPC.of(2, 1, 3).predict([0.0, np.nan])
+        drawn_mpc(2, 1, 3).predict([0.0, np.nan])
 
 
 def test_an_unsolved_qp_raises_even_if_it_is_masked():

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.problems import MIXED
+from tests.problems import MIXED, drawn_mpc
 from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, QPError, Scheme
 from torch_qpmpc.mpc.state import identity
 
@@ -50,16 +50,16 @@ def test_a_predictor_takes_the_place_of_the_models_C_and_b():
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_have_the_same_fields_and_theta(copied):
-    for scheme in (make(gamma=0.7, seed=3), Scheme(Layout(2, 1, 3, n_d=1), seed=4)):
-        twin = copied(scheme)
-        assert (twin.layout, twin.gamma, twin.seed) == (scheme.layout, scheme.gamma, scheme.seed)
-        assert twin.is_random == scheme.is_random
-        assert all(torch.equal(twin.theta[name], x) for name, x in scheme.theta.items())
+    scheme = make(gamma=0.7)
+    twin = copied(scheme)
+    assert (twin.layout, twin.gamma) == (scheme.layout, scheme.gamma)
+    assert all(torch.equal(twin.theta[name], x) for name, x in scheme.theta.items())
+    assert not copied(Scheme(Layout(2, 1, 3, n_d=1))).is_complete
 
 
 def test_the_arguments_in_a_file_make_the_same():
     mask = torch.arange(8 * 14).reshape(8, 14) % 3 == 0
-    mpc, file = QPMPC(make(seed=2), learn={"C": mask, "H": True}, step="projection"), io.BytesIO()
+    mpc, file = QPMPC(make(), learn={"C": mask, "H": True}, step="projection"), io.BytesIO()
     torch.save(mpc.arguments, file)
     file.seek(0)
     same(QPMPC.of(**torch.load(file, weights_only=True)), mpc)
@@ -80,7 +80,7 @@ def test_a_step_of_theta_leaves_the_scheme():
 def test_the_identity_has_the_sizes():
     message = "state_dict: got a state_dict with n_d = 2, expected this module's 0"
     with pytest.raises(QPError, match=message):
-        QPMPC.of(2, 1, 3).load_state_dict(QPMPC.of(2, 1, 3, n_d=2).state_dict())
+        drawn_mpc(2, 1, 3).load_state_dict(drawn_mpc(2, 1, 3, n_d=2).state_dict())
     assert set(asdict(make().layout)) <= identity(QPMPC(make())).keys()
 
 
@@ -88,9 +88,13 @@ def test_the_identity_has_the_sizes():
     ("make_it", "message"),
     [
         (lambda: make(gamma=0.0), r"gamma: got 0.0, expected a discount factor in \(0, 1\]"),
-        (lambda: make(seed=-1), "seed: got -1, expected a whole number >= 0"),
+        (lambda: QPMPC(make(cost=Cost())), "stage_weight: got none, expected the weight of"),
+        (
+            lambda: QPMPC(make(model=Model())),
+            r"A, B: got None, expected the model x\+ = A x \+ B u, matrices \(2, 2\) and",
+        ),
         (lambda: make(layout=(2, 1, 4)), "layout: got tuple, expected a Layout"),
-        (lambda: QPMPC((2, 1, 3)), "scheme: got tuple, expected a Scheme. QPMPC.of takes sizes."),  # pyright: ignore[reportArgumentType] (the mistake)
+        (lambda: QPMPC((2, 1, 3)), "scheme: got tuple, expected a Scheme. QPMPC.from_model takes"),  # pyright: ignore[reportArgumentType] (the mistake)
     ],
 )
 def test_bad_arguments_are_named(make_it, message):

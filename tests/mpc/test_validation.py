@@ -19,8 +19,8 @@ A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
 @pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8])
 def test_numpys_integers_are_integers(kind):
     check_whole("count", kind(3), 1)
-    mpc = QPMPC.of(kind(2), kind(1), kind(3), seed=kind(4))
-    expected, s = QPMPC.of(2, 1, 3, seed=4), torch.ones(2, 2)
+    theta, s = {"A": A, "B": B, "stage_weight": [1.0] * 3}, torch.ones(2, 2)
+    mpc, expected = QPMPC.of(kind(2), kind(1), kind(3), **theta), QPMPC.of(2, 1, 3, **theta)
     assert_close(mpc.value(s), expected.value(s), rtol=0, atol=0)
 
 

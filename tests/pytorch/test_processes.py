@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import grad, jacrev, vmap
 from torch.testing import assert_close
 
-from tests.problems import random_mpc, random_states
+from tests.problems import drawn_mpc, random_mpc, random_states
 from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -58,7 +58,7 @@ def check(mpcs: list[QPMPC], expected: list[dict[str, Tensor]], threads: int | N
     for mpc, known in zip(mpcs, expected, strict=True):
         compare(known, answers(mpc))
         assert torch.get_num_threads() == threads
-    large = QPMPC.of(6, 3, 40)  # of a size at which torch takes several threads
+    large = drawn_mpc(6, 3, 40)  # of a size at which torch takes several threads
     large.policy(random_states(2, 6))
     assert torch.get_num_threads() == threads
 

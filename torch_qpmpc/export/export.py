@@ -53,7 +53,8 @@ class Export:
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
+        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
         >>> export = qm.export_c(mpc, tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
         (['policy.h', 'policy.c'], 3)
@@ -231,7 +232,8 @@ class CompiledPolicy:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
+        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
         >>> policy = qm.CompiledPolicy(mpc)
         >>> s = torch.tensor([[1.0, 0.0], [-0.5, 0.3]])
         >>> torch.allclose(policy(s), mpc.policy(s))

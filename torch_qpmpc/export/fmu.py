@@ -71,7 +71,8 @@ def export_fmu(
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.of(2, 1, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=([-1.0], [1.0]))
+        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
+        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
         >>> export = qm.export_fmu(mpc, tempfile.mkdtemp() + "/policy.fmu")
         >>> [file.name for file in export.files]
         ['policy.fmu']

@@ -157,8 +157,9 @@ class QPActorValueOperator(_QPOperator):
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> from tensordict import TensorDict
-        >>> operator = qm.QPActorValueOperator(qm.QPMPC.of(2, 1, 5))
-        >>> td = TensorDict(observation=torch.zeros(3, 2), action=torch.zeros(3, 1), batch_size=3)
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 5, stage_weight=[1.0, 0.1])
+        >>> operator = qm.QPActorValueOperator(mpc)
+        >>> td = TensorDict(observation=torch.zeros(3, 1), action=torch.zeros(3, 1), batch_size=3)
         >>> operator(td)["state_action_value"].shape
         torch.Size([3, 1])
     """

@@ -65,16 +65,17 @@ class QPQLearningLoss(LossModule):
     Example:
         >>> import torch, torch_qpmpc as qm
         >>> from tensordict import TensorDict
-        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(qm.QPMPC.of(2, 1, 5)))
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 5, stage_weight=[1.0, 0.1])
+        >>> loss = qm.QPQLearningLoss(qm.QPActorValueOperator(mpc))
         >>> loss.make_value_estimator(gamma=0.9)
         >>> step = dict(
-        ...     observation=torch.ones(3, 2),
+        ...     observation=torch.ones(3, 1),
         ...     reward=-torch.ones(3, 1),
         ...     done=torch.zeros(3, 1).bool(),
         ...     terminated=torch.zeros(3, 1).bool(),
         ... )
         >>> batch = TensorDict(
-        ...     observation=torch.zeros(3, 2),
+        ...     observation=torch.zeros(3, 1),
         ...     action=torch.zeros(3, 1),
         ...     next=TensorDict(step, 3),
         ...     batch_size=3,

@@ -44,13 +44,13 @@ class ThetaNetwork(TensorDictModuleBase):
         >>> import torch, torch_qpmpc as qm
         >>> from tensordict import TensorDict
         >>> from tensordict.nn import TensorDictSequential
-        >>> mpc = qm.QPMPC.of(2, 1, 5)
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 5, stage_weight=[1.0, 0.1])
         >>> theta = qm.ThetaNetwork(mpc, {"q": 1.0, "b": 0.1})
         >>> operator = qm.QPActorValueOperator(mpc, theta_keys=theta.theta_keys)
         >>> loss = qm.QPQLearningLoss(TensorDictSequential(theta, operator))
         >>> policy = operator.get_policy_operator()
         >>> actor = TensorDictSequential(theta, policy, selected_out_keys=["action"])
-        >>> actor(TensorDict(observation=torch.ones(3, 2), batch_size=3))["action"].shape
+        >>> actor(TensorDict(observation=torch.ones(3, 1), batch_size=3))["action"].shape
         torch.Size([3, 1])
     """
 

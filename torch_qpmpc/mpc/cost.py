@@ -26,15 +26,13 @@ class Cost:
 
     Args:
         stage_weight: H_k, ``(n_x + n_u,)`` if diagonal, else ``(n_x + n_u, n_x + n_u)``, with an
-            optional leading N for one weight per stage. None draws a diagonal, uniform in (0.5, 5)
-            for states and zero for actions. With a preview and a dense H it may be one of
-            [d_k; x_k; u_k], whose block of (x_k, u_k) alone must be positive semidefinite: a
+            optional leading N for one weight per stage. With a preview and a dense H it may be one
+            of [d_k; x_k; u_k], whose block of (x_k, u_k) alone must be positive semidefinite: a
             price p times u_k is an entry 1 in both of their cross blocks.
         terminal_weight: H_f, ``(n_x,)`` or ``(n_x, n_x)``, or of [d_N; x_N]. ``"riccati"``: the
             cost to go of the linear quadratic regulator of A, B and the stage weight, about the x
             of least stage cost for d_N; not for a diagonal hessian. This is the default if it
-            exists, for one dense stage weight and no q; else the stage's own weight is. With a
-            random stage weight it is the identity.
+            exists, for one dense stage weight and no q; else the stage's own weight is.
         hessian: ``"diagonal"`` or ``"block"``, one dense block a stage.
         q, c: the linear cost ``(n_z,)`` and the constant, without discounts; zero by default.
 
@@ -65,25 +63,20 @@ class Cost:
         for name in names:
             object.__setattr__(self, name, owned(name, getattr(self, name)))
 
-    def hessians(
-        self, layout: Layout, A: Tensor, B: Tensor, gamma: float, random: torch.Generator
-    ) -> dict[str, Tensor]:
+    def hessians(self, layout: Layout, A: Tensor, B: Tensor, gamma: float) -> dict[str, Tensor]:
         """Return H and H_f of the sizes ``layout`` in the shapes for ``hessian``.
 
-        A terminal weight of the regulator is that of ``A``, ``B`` and ``gamma``; ``random`` draws a
-        stage weight that is None.
+        A terminal weight of the regulator is that of ``A``, ``B`` and ``gamma``.
 
         Raises:
-            QPError: a shape does not match the sizes, or a weight is not positive semidefinite.
+            QPError: there is no stage weight, a shape does not match the sizes, or a weight is not
+                positive semidefinite.
         """
         stage, terminal = self.stage_weight, self.terminal_weight
         if stage is None:
-            states = 0.5 + 4.5 * torch.rand(layout.n_x, generator=random, dtype=torch.float32)
-            stage = torch.cat((states, torch.zeros(layout.n_u))).double()
+            raise _without_weight(layout)
         if isinstance(terminal, str):
             terminal = terminal_riccati(A, B, stage, gamma, layout)
-        elif terminal is None and self.stage_weight is None:
-            terminal = torch.ones(layout.n_x, dtype=torch.float64)
         elif terminal is None:
             terminal = self._default_weight(layout, A, B, gamma)
         return _blocks(stage, terminal, self.hessian, layout)
@@ -140,17 +133,13 @@ def _blocks(stage: Tensor, terminal: Tensor, hessian: str, layout: Layout) -> di
     return {"H": stage, "H_f": terminal}
 
 
-def check_chosen(stage_weight: Any, layout: Layout) -> None:
-    """Raise `QPError` if nobody has chosen a stage cost.
-
-    A controller of a model must not start from a random one.
-    """
-    if stage_weight is None:
-        n_x, n_u = layout.n_x, layout.n_u
-        example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
-        remedy = (
-            f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
-            "weighted 1 and actions 0.1, twice the plant's own weights."
-        )
-        expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
-        raise QPError.expected("stage_weight", "none", expected, remedy)
+def _without_weight(layout: Layout) -> QPError:
+    """Make the error of a cost without a stage weight, with an example of these sizes."""
+    n_x, n_u = layout.n_x, layout.n_u
+    example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
+    remedy = (
+        f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
+        "weighted 1 and actions 0.1, twice the plant's own weights."
+    )
+    expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
+    return QPError.expected("stage_weight", "none", expected, remedy)

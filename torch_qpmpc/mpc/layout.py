@@ -186,7 +186,7 @@ class Layout:
         return self.rows(none, u, repeating & of_actions, D_f)
 
     def hessian(self, kind: str, stages: Tensor, terminal: Tensor, discount: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` (eq:qpH) from the weights of the stages and of x_N.
+        """Return H ``(n_z, n_z)`` (eq:qpH) from the weights of the ``stages`` and ``terminal``.
 
         Those of the ``kind`` "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H has
         entries for the plan only. ``discount`` has an entry for each of z.

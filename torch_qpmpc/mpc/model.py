@@ -17,9 +17,8 @@ from torch_qpmpc.mpc.validation import owned
 class Model:
     """The model x+ = A x + B u + E d + offset that the constraints ``C z = b`` start from.
 
-    If A or B is None, its entries are drawn at random, normal with standard deviation 0.1, and A
-    adds the identity. A discrete system of scipy or python-control whose states are measured
-    has such matrices: ``Model(system.A, system.B)``.
+    A discrete system of scipy or python-control whose states are measured has such matrices:
+    ``Model(system.A, system.B)``.
 
     Args:
         A: ``(n_x, n_x)``, or one per stage, ``(N, n_x, n_x)``.
@@ -66,23 +65,22 @@ class Model:
         """
         if self.A is None or self.B is None:
             name = "A" if self.A is None else "B"
-            raise QPError.expected(name, "None", "a matrix", "Or pass a Layout.")
+            raise QPError.expected(name, "None", "a matrix of x+ = A x + B u")
         n_d = 0 if self.E is None else self.E.shape[-1]
         return Layout(self.B.shape[-2], self.B.shape[-1], horizon, n_d)
 
-    def matrices(self, layout: Layout, random: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """Return A, B and E of the sizes ``layout``; A or B that is None is drawn by ``random``.
+    def matrices(self, layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
+        """Return A, B and E of the sizes ``layout``.
 
         Raises:
-            QPError: a shape does not match the sizes.
+            QPError: A or B is None, or a shape does not match the sizes.
         """
         n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
         A, B, E = self.A, self.B, self.E
-        if A is None:
-            noise = torch.randn(n_x, n_x, generator=random, dtype=torch.float32)
-            A = (torch.eye(n_x, dtype=torch.float32) + 0.1 * noise).double()
-        if B is None:
-            B = (0.1 * torch.randn(n_x, n_u, generator=random, dtype=torch.float32)).double()
+        if A is None or B is None:
+            want = f"the model x+ = A x + B u, matrices ({n_x}, {n_x}) and ({n_x}, {n_u})"
+            remedy = "QPMPC.from_data and identify fit one to a log."
+            raise QPError.expected("A, B", "None", want, remedy)
         E = A.new_zeros(n_x, n_d) if E is None else E
         if A.shape[-1:] != (n_x,) or B.shape[-1:] != (n_u,):
             got = f"shapes {tuple(A.shape)} and {tuple(B.shape)}"

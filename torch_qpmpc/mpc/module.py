@@ -5,7 +5,6 @@ All values are costs to go, as in the paper; rewards appear only in `torch_qpmpc
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.identification.identification import measured_model, model_arguments
 from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
-from torch_qpmpc.mpc.cost import check_chosen
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
@@ -36,7 +34,6 @@ from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
     STRUCTURES,
-    as_tensor,
     check_learn,
     check_no_levels,
     check_one_model,
@@ -53,18 +50,13 @@ from torch_qpmpc.qp.tracing import is_differentiating, is_eager, serially_if_for
 
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")
-#: The warning of a random start.
-RANDOM = (
-    "This QPMPC acts with a random model or stage cost, which is a start to learn from and not a "
-    "controller. Pass A, B and stage_weight, or use QPMPC.from_model or QPMPC.from_data."
-)
 
 
 class QPMPC(nn.Module):
     """A parametric QP (eq:qp5) that starts from a `Scheme`.
 
-    `of` makes one from sizes, `from_model` from a model, `from_data` from a log, and `linear_mpc`
-    one that stays a linear MPC scheme.
+    `from_model` makes one from a model, `from_data` from a log, `of` from a scheme's arguments, and
+    `linear_mpc` one that stays a linear MPC scheme.
 
     Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
     stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
@@ -150,13 +142,13 @@ class QPMPC(nn.Module):
         schedule: BlendedModel | Mapping[str, Tensor] | None = None,
     ) -> None:
         super().__init__()
-        check_kind("scheme", scheme, Scheme, "QPMPC.of takes sizes.")
+        check_kind("scheme", scheme, Scheme, "QPMPC.from_model takes A and B.")
         check_choice("structure", structure, STRUCTURES)
         check_choice("on_failure", on_failure, ON_FAILURE)
         check_step(step)
         check_learn(learn, structure, scheme.layout.n_linear)
         backend(solver)
-        self.scheme, self.layout, self._random = scheme, scheme.layout, scheme.is_random
+        self.scheme, self.layout = scheme, scheme.layout
         self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
         self.n_d, self.gamma = self.layout.n_d, scheme.gamma
         self.levels = Levels.of(scheme)
@@ -194,13 +186,15 @@ class QPMPC(nn.Module):
 
     @classmethod
     def of(cls, n_x: int, n_u: int, horizon: int, n_d: int = 0, **options: Any) -> Self:
-        """Return a QPMPC of these sizes, at random where no model or stage cost is passed.
-
-        A `UserWarning` reports a random start when the policy first acts.
+        """Return a QPMPC of these sizes and of the arguments of its scheme by name.
 
         Args:
             n_x, n_u, horizon, n_d: see `Layout`.
-            options: the keyword arguments of `QPMPC` and of `Scheme.of`.
+            options: the keyword arguments of `QPMPC` and of `Scheme.of`, with A, B and
+                ``stage_weight`` at least.
+
+        Raises:
+            QPError: an argument is missing or invalid.
         """
         own = {x: options.pop(x) for x in (*KEYWORDS, "schedule") if x in options}
         return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
@@ -217,11 +211,8 @@ class QPMPC(nn.Module):
         Raises:
             QPError: an argument is invalid, or there is no stage cost.
         """
-        for name, matrix in (("A", A), ("B", B)):
-            as_tensor(name, matrix)  # None would be drawn at random
         layout = Model(A, B, options.get("E")).layout(horizon)
         check_names(options)
-        check_chosen(options.get("stage_weight"), layout)
         arguments = {"n_d": layout.n_d, "A": A, "B": B} | options
         return cls.of(layout.n_x, layout.n_u, layout.horizon, **arguments)
 
@@ -521,7 +512,8 @@ class QPMPC(nn.Module):
         """
         content = load_file(path, KIND)
         try:
-            mpc = cls.of(**content["arguments"])
+            arguments = {x: y for x, y in content["arguments"].items() if x != "seed"}  # unused
+            mpc = cls.of(**arguments)
             mpc.load_state_dict(content["mpc"])
         except Exception as error:  # damaged files raise errors of any type
             remedy = {}
@@ -614,7 +606,6 @@ class QPMPC(nn.Module):
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
         super()._load_from_state_dict(self.checked_state(state_dict, prefix), prefix, *args)
-        self._random = False
         self._derive()
 
     def _derive(self) -> None:
@@ -670,7 +661,7 @@ class QPMPC(nn.Module):
         From none, it does not depend on earlier calls, so that a resumed run repeats it. The
         preparation is kept until theta changes; it is None, too, if that cannot be seen.
         """
-        if self._random or self.schedule is not None or self.levels is not None:
+        if self.schedule is not None or self.levels is not None:
             return None
         leaves, at_rest = vars(self).get("_at_rest", (None, None))
         if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:
@@ -693,10 +684,7 @@ class QPMPC(nn.Module):
         return replace(qp, C=C, b=b, check_values=False)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
-        """Return u_0 of a solution of V's QP, and tell of a random start the first time."""
-        if self._random and not torch.compiler.is_compiling():
-            self._random = False
-            warnings.warn(RANDOM, UserWarning, stacklevel=3)
+        """Return u_0 of a solution of V's QP."""
         return to_dtype(solution.z[..., self.n_p : self.n_p + self.n_u], dtype)
 
     def _cost(self, theta: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind, check_number, check_seed
+from torch_qpmpc.checks import check_kind, check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
@@ -34,11 +34,10 @@ class Scheme:
 
     Args:
         layout: the sizes; the scheme counts the rows of its bounds itself.
-        model: A, B, E and the offset; drawn at random by default.
-        cost: the weights; drawn at random by default.
+        model: A, B, E and the offset.
+        cost: the weights. A `QPMPC` needs A, B and a stage weight.
         bounds: no bounds by default.
         gamma: discount of the stage costs, 0 < gamma <= 1.
-        seed: the seed of random parts.
         constants: the entries of p that have one value only, such as a 1 in the state, by index.
 
     Raises:
@@ -60,7 +59,6 @@ class Scheme:
     cost: Cost = field(default_factory=Cost)
     bounds: Bounds = field(default_factory=Bounds)
     gamma: float = GAMMA
-    seed: int = 0
     constants: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,11 +66,10 @@ class Scheme:
         for name, kind in kinds.items():
             check_kind(name, getattr(self, name), kind)
         check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
-        check_seed(self.seed)
         object.__setattr__(self, "gamma", float(self.gamma))
-        object.__setattr__(self, "seed", int(self.seed))
         object.__setattr__(self, "layout", self.bounds.counted(self.layout))
-        _ = self.theta  # which compares shapes and checks the cost
+        # Compares shapes and checks the cost.
+        _ = self.theta if self.is_complete else self.bounds.rows(self.layout)
 
     @classmethod
     def of(
@@ -84,7 +81,6 @@ class Scheme:
         *,
         blocks: Sequence[int] = (),
         gamma: float = GAMMA,
-        seed: int = 0,
         constants: Mapping[int, float] | None = None,
         **options: Any,
     ) -> Scheme:
@@ -92,7 +88,7 @@ class Scheme:
 
         Args:
             n_x, n_u, horizon, n_d, blocks: see `Layout`.
-            gamma, seed, constants: see `Scheme`.
+            gamma, constants: see `Scheme`.
             options: the arguments of `Model`, `Cost` and `Bounds`.
 
         Raises:
@@ -105,9 +101,7 @@ class Scheme:
         )
         if options:
             check_names(options, also=())
-        return cls(
-            layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, seed, constants or {}
-        )
+        return cls(layout, Model(**model), Cost(**cost), Bounds(**bounds), gamma, constants or {})
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -117,14 +111,14 @@ class Scheme:
             **{name: getattr(self.layout, name) for name in (*SIZES, "blocks")},
             **{x.name: getattr(part, x.name) for part in parts for x in fields(part)},
             "gamma": self.gamma,
-            "seed": self.seed,
             "constants": {**self.constants},
         }
 
     @property
-    def is_random(self) -> bool:
-        """True if the model or the stage cost is drawn at random."""
-        return self.model.A is None or self.model.B is None or self.cost.stage_weight is None
+    def is_complete(self) -> bool:
+        """True if there are A, B and a stage weight."""
+        parts = (self.model.A, self.model.B, self.cost.stage_weight)
+        return all(part is not None for part in parts)
 
     @property
     def of_actions(self) -> Tensor:
@@ -162,11 +156,10 @@ class Scheme:
 def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
     """Return C_0 and theta."""
     layout, model, cost = scheme.layout, scheme.model, scheme.cost
-    random = torch.Generator().manual_seed(scheme.seed)
-    A, B, E = model.matrices(layout, random)
+    A, B, E = model.matrices(layout)
     C_0 = banded_matrix(A, B, layout.horizon, E)
     theta = {
-        **cost.hessians(layout, A, B, scheme.gamma, random),
+        **cost.hessians(layout, A, B, scheme.gamma),
         "q": torch.zeros(layout.n_z, dtype=torch.float64),
         "c": torch.zeros((), dtype=torch.float64),
         "C": C_0,
@@ -186,7 +179,7 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
 def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, "schedule")) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
-    known = {"blocks", "gamma", "seed", "constants", *SIZES}
+    known = {"blocks", "gamma", "constants", *SIZES}
     check_keywords("QPMPC", options, own | known | {*also})
 
 

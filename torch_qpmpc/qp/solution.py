@@ -85,7 +85,8 @@ class QPSolution:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.of(1, 1, 1, A=[[1.0]], B=[[1.0]], action_bounds=([-1.0], [1.0]))
+        >>> options = {"stage_weight": [1.0, 0.1], "action_bounds": ([-1.0], [1.0])}
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 1, **options)
         >>> solution = mpc.solve(torch.tensor([3.0]))  # z = (x_0, u_0, x_1)
         >>> solution.z.detach().round(decimals=3).tolist(), solution.active.tolist()
         ([3.0, -1.0, 2.0], [0, -1, 0])

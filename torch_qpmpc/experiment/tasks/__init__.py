@@ -75,7 +75,7 @@ def _make(
     learn: Collection[str],
     schedule: BlendedModel | None = None,
 ) -> QPMPC:
-    if scheme.is_random:
+    if not scheme.is_complete:
         got = f"{cfg.task.name!r}, whose scheme has no model or no stage weight"
         raise QPError.expected("task.name", got, "a scheme with both", "Or use start=data.")
     choice = cfg.task.terminal_weight

@@ -97,7 +97,10 @@ def given_scheme(cfg: DictConfig, plant: GymnasiumPlant) -> Scheme:
         for rows in map(cfg.task.get, shapes)
     )
     if cfg.start.name == "data":
-        A = B = None
+        A, B, sizes = None, None, [(n + n_u, n + n_u) for n in (n_y, n_x)]
+        if weight is not None and weight.shape not in sizes:
+            got, want = f"shape {tuple(weight.shape)}", f"shape {sizes[0]}"
+            raise QPError.expected("task.stage_weight", got, want)
     if weight is not None and len(weight) == n_y + n_u:  # the outputs are the first states
         seen = torch.cat((torch.arange(n_y), torch.arange(n_x, n_x + n_u)))
         own, weight = weight, weight.new_zeros(n_x + n_u, n_x + n_u)

@@ -60,9 +60,9 @@ class SolveLog:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.of(2, 1, 5)
+        >>> mpc = qm.QPMPC.from_model([[1.0]], [[1.0]], 5, stage_weight=[1.0, 0.1])
         >>> with qm.SolveLog() as log:
-        ...     values = mpc.value(torch.zeros(8, 2))
+        ...     values = mpc.value(torch.zeros(8, 1))
         >>> log.solves, log.unsolved
         (8, 0)
     """
