@@ -50,10 +50,13 @@ def house(horizon: int = 8) -> QPMPC:
 
 def tied(horizon: int = 8, **options: Any) -> QPMPC:
     """Make a linear MPC scheme with mixed constraints, of which a terminal one is hard."""
-    return QPMPC.linear_mpc(
+    return QPMPC.from_model(
         torch.tensor([[1.0, 0.2], [-0.1, 0.95]]),
         torch.tensor([[0.0], [0.2]]),
         horizon,
+        structure="tied",
+        hessian="block",
+        discount_slack=True,
         action_bounds=([-1.0], [1.0]),
         state_bounds=([-2.0, -1.0], [2.0, 1.0]),
         constraints=([[1.0, 0.5, 1.0], [0.0, 1.0, -1.0]], [-0.8, -torch.inf], [0.8, 0.6]),

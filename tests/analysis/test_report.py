@@ -17,8 +17,8 @@ WRONG_A, WRONG_B = A + torch.tensor([[0.0, 0.03], [-0.04, 0.0]]), 1.5 * B
 
 
 def scheme() -> QPMPC:
-    options = {"stage_weight": [1.0] * 3, "structure": "free", "solver": "daqp"}
-    return QPMPC.linear_mpc(WRONG_A, WRONG_B, 6, **options)
+    options = {"stage_weight": [1.0] * 3, "hessian": "block", "solver": "daqp"}
+    return QPMPC.from_model(WRONG_A, WRONG_B, 6, **options)
 
 
 def test_a_scheme_is_read_in_any_gauge():

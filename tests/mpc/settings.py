@@ -47,8 +47,10 @@ def shifted(mpc: QPMPC, free: float, seed: int) -> QPMPC:
 def linear(seed: int = 0, *, free: float = 0.05, horizon: int = 4, **options: Any) -> QPMPC:
     """Make a linear MPC scheme."""
     box = {"state_bounds": ([-1.0, -1.0], [1.0, 1.0]), "action_bounds": ([-0.5], [0.5])}
-    settings = {**box, "stage_weight": W, "solver": "daqp"} | options
-    return shifted(QPMPC.linear_mpc(A, B, horizon, **settings), free, seed)
+    parts = [part for part in EVERYTHING if part != "G" or "constraints" in options]
+    settings = {**box, "stage_weight": W, "solver": "daqp", "hessian": "block", "learn": parts}
+    settings |= {"structure": "tied", "discount_slack": True} | options
+    return shifted(QPMPC.from_model(A, B, horizon, **settings), free, seed)
 
 
 def previewed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:

@@ -108,7 +108,8 @@ def test_a_tied_model_with_a_known_row():
     """x_1 integrates x_2 in every stage, so its row of A and B is known."""
     A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
     learn = {"C": rows().logical_not(), "H": True}
-    mpc = QPMPC.linear_mpc(A, B, HORIZON, stage_weight=[1.0] * 3, learn=learn, solver="daqp")
+    options = {"structure": "tied", "learn": learn, "solver": "daqp"}
+    mpc = QPMPC.from_model(A, B, HORIZON, stage_weight=[1.0] * 3, **options)
     optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.01, weight_decay=0.1)
     for _ in range(3):
         optimizer.zero_grad()

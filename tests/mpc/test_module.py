@@ -85,7 +85,8 @@ def test_the_value_is_the_least_action_value_and_that_of_the_policy(name):
 @pytest.mark.parametrize("n_d", [0, N_D])
 def test_without_active_bounds_it_is_the_linear_quadratic_regulator(horizon, n_d):
     options = {"E": E} if n_d else {}
-    mpc = QPMPC.linear_mpc(A, B, horizon, gamma=0.9, stage_weight=W, solver="daqp", **options)
+    options |= {"gamma": 0.9, "hessian": "block", "solver": "daqp"}
+    mpc = QPMPC.from_model(A, B, horizon, stage_weight=W, **options)
     P, s = riccati_weight(A, B, W, 0.9), random_states(5)
     p = torch.cat((torch.zeros(5, (horizon + 1) * n_d), s), -1)
     assert_close(mpc.value(p).detach(), 0.5 * ((s @ P) * s).sum(-1), rtol=1e-7, atol=1e-9)

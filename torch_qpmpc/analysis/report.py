@@ -106,7 +106,8 @@ def read(
         >>> import torch, torch_qpmpc as qm
         >>> from torch_qpmpc.analysis.report import read
         >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
-        >>> reading = read(qm.QPMPC.linear_mpc(A, B, 10, stage_weight=[1.0, 1.0, 1.0]))
+        >>> mpc = qm.QPMPC.from_model(A, B, 10, stage_weight=[1.0] * 3, hessian="block")
+        >>> reading = read(mpc)
         >>> reading.distance_to_mpc < 1e-9, round(reading.radius_predicted, 2)
         (True, 0.97)
     """

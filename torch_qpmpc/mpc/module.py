@@ -55,8 +55,7 @@ LEARN = ("H", "c", "C")
 class QPMPC(nn.Module):
     """A parametric QP (eq:qp5) that starts from a `Scheme`.
 
-    `from_model` makes one from a model, `from_data` from a log, `of` from a scheme's arguments, and
-    `linear_mpc` one that stays a linear MPC scheme.
+    `from_model` makes one from a model, `from_data` from a log, `of` from a scheme's arguments.
 
     Its variable is z = [x_0, u_0, x_1, .., x_N], n_z = N (n_x + n_u) + n_x. The cost (eq:qpH) has a
     stage block H_k, q_k for (x_k, u_k), discounted by gamma^k, and a terminal block H_f, q_f for
@@ -263,31 +262,6 @@ class QPMPC(nn.Module):
                 arguments["terminal_weight"] = cost.terminal_weight
             arguments = {"q": cost.q, "c": cost.c} | arguments
         return cls.of(**arguments)
-
-    @classmethod
-    def linear_mpc(cls, A: Any, B: Any, horizon: int, **options: Any) -> Self:
-        """Return a linear MPC scheme with all parts learned (eq:v1, eq:q1).
-
-        It is `from_model`, with its arguments and errors, and other defaults: ``structure="tied"``,
-        dense weights, discounted slack weights, and all parts of theta in ``learn``.
-
-        Args:
-            A, B, horizon, options: see `from_model`.
-
-        Example:
-            >>> import torch, torch_qpmpc as qm
-            >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
-            >>> cost, bounds = [1.0, 1.0, 0.1], ([-1.0], [1.0])
-            >>> mpc = qm.QPMPC.linear_mpc(A, B, 10, stage_weight=cost, action_bounds=bounds)
-            >>> [tuple(part.shape) for part in mpc.model()]
-            [(2, 2), (2, 1)]
-        """
-        hessian = options.get("hessian", "block")
-        learn = ["H", "H_f", "q", "c", "C", "b", "lb", "ub", "w"]
-        if {"constraints", "terminal_constraints"} & options.keys():
-            learn.append("G")
-        defaults = {"structure": "tied", "hessian": hessian, "discount_slack": True}
-        return cls.from_model(A, B, horizon, **{**defaults, "learn": learn, **options})
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return V(s) (eq:qp4), a cost to go: s ``(*batch, n_p)`` to ``(*batch,)``.
