@@ -196,7 +196,7 @@ def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
     v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
     lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
     steps = torch.zeros(len(programs), dtype=torch.int64)
-    return programs.reduced_qps().in_torch(), BackendSolution(v, lam, steps)
+    return SoftQPs._make(map(to_tensor, programs.reduced_qps())), BackendSolution(v, lam, steps)
 
 
 def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:

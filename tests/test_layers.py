@@ -39,7 +39,7 @@ BUDGET = {
     "identification": 2430,
     "mpc": 3770,
     "proofs": 1001,
-    "qp": 6060,
+    "qp": 5995,
     "study": 550,
 }
 #: Libraries that only some layers may import.

@@ -12,8 +12,7 @@ from torch import Tensor
 from tests.campaign.families import Case
 from tests.campaign.outcomes import finite_gradients, judge
 from torch_qpmpc import QuadraticProgram, Status, solve_qp
-from torch_qpmpc.qp.batching import broadcast
-from torch_qpmpc.qp.program import EVENT_SHAPES, UNKNOWN
+from torch_qpmpc.qp.program import EVENT_SHAPES, UNKNOWN, broadcast
 from torch_qpmpc.qp.solution import QPSolution
 
 #: Largest allowed time of a QP in seconds of one core.

@@ -70,7 +70,7 @@ def scenario(method: str, *solvers: str) -> None:
     mpcs = [random_mpc(0, solver=name).share_memory() for name in solvers or BACKENDS]
     expected = [answers(mpc) for mpc in mpcs]
     context: Any = torch.multiprocessing.get_context(method)
-    threads = 2 if method == "fork" else None
+    threads = 1 if method == "fork" else None
     child = context.Process(target=check, args=(mpcs, expected, threads), daemon=True)
     child.start()
     child.join(WATCHDOG)

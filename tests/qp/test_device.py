@@ -231,7 +231,7 @@ def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
             return answer
 
         monkeypatch.setattr(device.interior_point, "solve", spoilt)
-        monkeypatch.setitem(BACKENDS, "torch", whole)
+        monkeypatch.setitem(BACKENDS, "torch", BACKENDS["daqp"])
         with in_tensors():
             solution = mpc.to(DEVICE).solve(s.to(DEVICE))
         assert_close(solution.value.cpu(), expected.value, rtol=1e-9, atol=1e-9)

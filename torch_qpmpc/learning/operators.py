@@ -20,7 +20,6 @@ from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.parameters import check_names
-from torch_qpmpc.qp.batching import to_dtype
 from torch_qpmpc.qp.program import QuadraticProgram
 
 #: The key of the known signals, as environments emit them.
@@ -84,7 +83,7 @@ class _QPOperator(TensorDictModuleBase):
             start = tensordict.get(self.active_set_key, None)
             solution = self.module.solve(*inputs, warm_start=start, qp=qp)
             tensordict.set(self.active_set_key, solution.active)
-            cost = to_dtype(solution.value, inputs[0].dtype)
+            cost = solution.value.to(inputs[0].dtype)
         return tensordict.set(self.out_keys[0], -cost.unsqueeze(-1))
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -40,13 +41,12 @@ from torch_qpmpc.mpc.validation import (
     check_pair,
     learned_entries,
 )
-from torch_qpmpc.qp.batching import full_precision, to_dtype
 from torch_qpmpc.qp.pipeline.solve import ON_FAILURE, AtRest
 from torch_qpmpc.qp.program import QuadraticProgram
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.solvers import backend
-from torch_qpmpc.qp.tracing import is_differentiating, is_eager, serially_if_forked
+from torch_qpmpc.qp.tracing import full_precision, is_differentiating, is_eager
 
 #: The parts of theta that are learned by default.
 LEARN = ("H", "c", "C")
@@ -160,7 +160,6 @@ class QPMPC(nn.Module):
         if (device := torch.get_default_device()).type != "cpu":
             self.to(device)
 
-    @serially_if_forked
     def _start(self, learn: Collection[str]) -> None:
         """Register the scheme's theta as parameters and buffers."""
         theta = dict(self.scheme.theta)
@@ -268,14 +267,14 @@ class QPMPC(nn.Module):
 
         ``qp`` and errors are as in `solve`.
         """
-        return to_dtype(self._solve(self._checked(s), qp).value, s.dtype)
+        return self._solve(self._checked(s), qp).value.to(s.dtype)
 
     def action_value(self, s: Tensor, a: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
         """Return Q(s, a) (eq:qp5), a cost to go, from ``(*batch, n_p)`` and ``(*batch, n_u)``.
 
         ``qp`` and errors are as in `value`.
         """
-        return to_dtype(self._solve(self._checked(s, a), qp).value, s.dtype)
+        return self._solve(self._checked(s, a), qp).value.to(s.dtype)
 
     def policy(
         self,
@@ -420,7 +419,6 @@ class QPMPC(nn.Module):
             of_plan = leaf[..., self.n_d :, self.n_d :] if dense else leaf[..., None, None]
             of_plan.copy_(NEAREST[self.step](of_plan))
 
-    @serially_if_forked
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
 
@@ -439,8 +437,16 @@ class QPMPC(nn.Module):
                 theta = parameters.moved(self, residuals)
             else:
                 theta = {part: getattr(self, part) for part in (*COST, *CONSTRAINTS)}
-            H, q, w = self._cost(theta)
-            c, C, b, G, lb, ub = (theta[part] for part in ("c", *CONSTRAINTS))
+            hessian = partial(self.layout.hessian, self.hessian, discount=self.discount)
+            weights = theta["H"], theta["H_f"]
+            if residuals is None:
+                H = hessian(*weights)
+            else:
+                H = parameters.for_each(hessian, weights, self._block_ndims)
+            q = self.discount * theta["q"]
+            # A hard row's w is a placeholder, to which its hardness adds inf.
+            w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
+            c, C, b, G, lb, ub = map(theta.__getitem__, ("c", *CONSTRAINTS))
             if self.layout.blocks:
                 rows = self.repetitions.expand(*C.shape[:-2], -1, -1)
                 C, b = torch.cat((C, rows), -2), F.pad(b, (0, rows.shape[-2]))
@@ -612,10 +618,12 @@ class QPMPC(nn.Module):
         warm_start: QPSolution | Tensor | None = None,
         on_failure: str | None = None,
     ) -> QPSolution:
-        qp = self.quadratic_program() if qp is None else qp
-        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
+        if qp is None:
+            qp = self.quadratic_program()
+        else:
+            check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
-        fixed = to_dtype(fixed, qp.C.dtype)
+        fixed = fixed.to(qp.C.dtype)
         if self.schedule is not None:
             qp = self._scheduled(qp, fixed[..., : self.n_p])
         on_failure = on_failure or self.on_failure
@@ -659,18 +667,7 @@ class QPMPC(nn.Module):
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP."""
-        return to_dtype(solution.z[..., self.n_p : self.n_p + self.n_u], dtype)
-
-    def _cost(self, theta: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return H, q and w of the QP with the parts ``theta``."""
-
-        def hessian(stages: Tensor, terminal: Tensor) -> Tensor:
-            return self.layout.hessian(self.hessian, stages, terminal, self.discount)
-
-        H = parameters.for_each(hessian, [theta["H"], theta["H_f"]], self._block_ndims)
-        # A hard row's w is a placeholder, to which its hardness adds inf.
-        w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
-        return H, self.discount * theta["q"], w
+        return solution.z[..., self.n_p : self.n_p + self.n_u].to(dtype)
 
     def _parametrizations_for(self, name: str, value: Tensor) -> list[nn.Module]:
         mask = self._masks.get(name)

@@ -23,8 +23,8 @@ from torch_qpmpc.checks import check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Masked, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
-from torch_qpmpc.qp.batching import broadcast, to_dtype
 from torch_qpmpc.qp.kernels.linalg import equal
+from torch_qpmpc.qp.program import broadcast
 from torch_qpmpc.qp.tracing import PLAIN
 
 #: Parts with more entries are large.
@@ -237,8 +237,7 @@ def _with_residuals(
     module: nn.Module, part: str, before: dict[str, Tensor], residuals: dict[str, Tensor]
 ) -> Tensor:
     after = [
-        x + to_dtype(residuals[name], x.dtype) if name in residuals else x
-        for name, x in before.items()
+        x + residuals[name].to(x.dtype) if name in residuals else x for name, x in before.items()
     ]
     if not parametrize.is_parametrized(module, part):
         return after[0]

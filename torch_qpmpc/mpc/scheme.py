@@ -17,7 +17,6 @@ from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import SIZES, Layout, banded_matrix
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.qp.tracing import serially_if_forked
 
 #: The paper's discount, the default.
 GAMMA = 0.9
@@ -152,7 +151,6 @@ class Scheme:
         return type(self), tuple(getattr(self, x.name) for x in fields(self))
 
 
-@serially_if_forked
 def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
     """Return C_0 and theta."""
     layout, model, cost = scheme.layout, scheme.model, scheme.cost

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_tensor, ungraded
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import broadcast, to_dtype
+from torch_qpmpc.qp.program import broadcast
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -158,4 +158,4 @@ def check_pair(s: Tensor, a: Tensor, n_p: int, n_u: int, device: torch.device) -
         raise QPError.expected("a", got, want) from error
     if not s.shape[:-1] == a.shape[:-1] == batch:
         s, a = s.expand(*batch, -1), a.expand(*batch, -1)
-    return torch.cat((s, to_dtype(a, s.dtype)), dim=-1)
+    return torch.cat((s, a.to(s.dtype)), dim=-1)

@@ -1,24 +1,12 @@
-"""Batch dimensions and dtypes: broadcasting, alignment under vmap, sums in gradients."""
+"""Batch dimensions: alignment under vmap, products, sums in gradients."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-import torch
 from torch import Tensor
-
-
-def broadcast(*shapes: Sequence[int]) -> torch.Size:
-    """Return `torch.broadcast_shapes`, faster for shapes that are equal or empty."""
-    common: Sequence[int] = ()
-    for shape in filter(len, shapes):
-        if len(common) and tuple(shape) != tuple(common):
-            return torch.broadcast_shapes(*shapes)
-        common = shape
-    return torch.Size(common)
 
 
 def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
@@ -63,19 +51,6 @@ def times(matrix: Tensor, vector: Tensor) -> Tensor:
 def flatten_batch(vectors: Tensor) -> Tensor:
     """Flatten ``(*batch, n)`` to ``(B, n)``, also for n = 0, where -1 would be ambiguous."""
     return vectors.reshape(math.prod(vectors.shape[:-1]), vectors.shape[-1])
-
-
-def to_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return ``tensor.to(dtype)``, faster if the dtype is the same."""
-    return tensor if tensor.dtype == dtype else tensor.to(dtype)
-
-
-def full_precision(like: Tensor) -> AbstractContextManager[object]:
-    """Return a context without autocast on the device of ``like``."""
-    device = like.device.type
-    if device == "meta" or not torch.is_autocast_enabled(device):
-        return nullcontext()
-    return torch.autocast(device, enabled=False)
 
 
 def schema(tensors: Sequence[str], others: str, n_outputs: int) -> str:

@@ -45,7 +45,7 @@ from torch_qpmpc.qp.batching import outer, times, weighted_sum
 from torch_qpmpc.qp.kkt import kkt
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solution import saturated_rows, slacks, upper_share
-from torch_qpmpc.qp.tracing import is_differentiating, serially_if_forked
+from torch_qpmpc.qp.tracing import is_differentiating
 
 #: Tangents of H, q, c, C, b, G, lb, ub, w, fixed; None for zero.
 Tangents = Sequence[Tensor | None]
@@ -75,7 +75,6 @@ def envelope_gradients(
     }
 
 
-@serially_if_forked
 def gradients(
     incoming: Sequence[Tensor | None],
     theta: Sequence[Tensor],
@@ -153,7 +152,6 @@ def _solution_gradients(
     return (f() if need else None for f, need in zip(formulas, needed, strict=True))
 
 
-@serially_if_forked
 def tangents(
     d_theta: Tangents, theta: Sequence[Tensor], solution: Sequence[Tensor], n_kept: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -24,7 +24,6 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import broadcast
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
 EVENT_SHAPES: dict[str, tuple[str, ...]] = {
@@ -84,6 +83,16 @@ _EXPLANATIONS = {
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
     "semidefinite; check the parameters and the state",
 }
+
+
+def broadcast(*shapes: Sequence[int]) -> torch.Size:
+    """Return `torch.broadcast_shapes`, faster for shapes that are equal or empty."""
+    common: Sequence[int] = ()
+    for shape in filter(len, shapes):
+        if len(common) and tuple(shape) != tuple(common):
+            return torch.broadcast_shapes(*shapes)
+        common = shape
+    return torch.Size(common)
 
 
 def batch_shape(tensors: Sequence[Tensor]) -> torch.Size:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import full_precision
 from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.tracing import has_values
+from torch_qpmpc.qp.tracing import full_precision, has_values
 
 #: A multiplier below this fraction of the largest is zero; one this close to w is saturated.
 ACTIVE_FRACTION = 1e-8

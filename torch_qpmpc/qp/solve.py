@@ -15,10 +15,10 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.qp.batching import align, broadcast, schema
+from torch_qpmpc.qp.batching import align, schema
 from torch_qpmpc.qp.derivatives import N_THETA, gradients, tangents
 from torch_qpmpc.qp.pipeline.solve import solve_now
-from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, QuadraticProgram
+from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, QuadraticProgram, broadcast
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.tracing import is_differentiating, is_eager, is_forward_mode, transforms
 
@@ -91,18 +91,24 @@ def solve(
 
     V and Q that keep the same entries share one elimination. None keeps the fixed entries.
     """
-    batch = _checked_batch(qp, fixed)
-    start = _checked_start(qp, batch, warm_start)
+    _check_fixed(qp, fixed)
     theta = (*qp.tensors(), fixed)
+    try:
+        batch = broadcast(qp.batch_shape, fixed.shape[:-1])
+    except RuntimeError as error:
+        got, shape = f"shape {tuple(fixed.shape)}", tuple(qp.batch_shape)
+        expected = f"leading dimensions that broadcast with the QP's batch {shape}"
+        raise QPError.expected("fixed", got, expected) from error
     n_kept = fixed.shape[-1] if n_kept is None else n_kept
     run: Callable[..., tuple[Tensor, ...]] = solve_traced
     if is_eager(theta):
         learned = torch.is_grad_enabled() and any(x.requires_grad for x in theta)
         run = Eager.apply if learned else solve_now
+    start = None if warm_start is None else _active(warm_start, (*batch, qp.lb.shape[-1]))
     return QPSolution(qp, *run(*theta, start, n_kept, solver, on_failure))
 
 
-def _checked_batch(qp: QuadraticProgram, fixed: Tensor) -> tuple[int, ...]:
+def _check_fixed(qp: QuadraticProgram, fixed: Tensor) -> None:
     if not isinstance(fixed, Tensor) or not fixed.is_floating_point():
         got = fixed.dtype if isinstance(fixed, Tensor) else type(fixed).__name__
         raise QPError.expected("fixed", got, "a floating-point torch.Tensor", "Convert it first.")
@@ -111,37 +117,20 @@ def _checked_batch(qp: QuadraticProgram, fixed: Tensor) -> tuple[int, ...]:
         raise QPError.expected("fixed", got, f"one on the QP's {qp.q.device}", remedy)
     n_z = qp.q.shape[-1]
     if fixed.ndim == 0 or fixed.shape[-1] > n_z:
-        got, expected = (
-            f"shape {tuple(fixed.shape)}",
-            f"shape (*batch, n_f) with n_f <= n_z = {n_z}",
-        )
-        raise QPError.expected("fixed", got, expected)
-    try:
-        return broadcast(qp.batch_shape, fixed.shape[:-1])
-    except RuntimeError as error:
-        got = f"shape {tuple(fixed.shape)}"
-        shape = tuple(qp.batch_shape)
-        expected = f"leading dimensions that broadcast with the QP's batch {shape}"
-        raise QPError.expected("fixed", got, expected) from error
+        expected = f"shape (*batch, n_f) with n_f <= n_z = {n_z}"
+        raise QPError.expected("fixed", f"shape {tuple(fixed.shape)}", expected)
 
 
-def _checked_start(
-    qp: QuadraticProgram, batch: tuple[int, ...], warm_start: QPSolution | Tensor | None
-) -> Tensor | None:
-    if warm_start is None:
-        return None
+def _active(warm_start: QPSolution | Tensor, want: tuple[int, ...]) -> Tensor:
+    """Return the active set of a warm start, of the shape that the QPs ``want``."""
     if not isinstance(warm_start, QPSolution | Tensor):
         got = type(warm_start).__name__
         raise QPError.expected("warm_start", got, "a QPSolution, or its `active`")
     active = warm_start if isinstance(warm_start, Tensor) else warm_start.active
-    want = (*batch, qp.lb.shape[-1])
     if tuple(active.shape) != want or active.dtype is not torch.int8:
-        raise QPError.expected(
-            "warm_start",
-            f"shape {tuple(active.shape)} of {active.dtype}",
-            f"{want} of torch.int8",
-            "Pass the solution of the same batch of QPs, or its `active`.",
-        )
+        got, expected = f"shape {tuple(active.shape)} of {active.dtype}", f"{want} of torch.int8"
+        remedy = "Pass the solution of the same batch of QPs, or its `active`."
+        raise QPError.expected("warm_start", got, expected, remedy)
     return active
 
 

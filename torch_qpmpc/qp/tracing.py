@@ -1,4 +1,4 @@
-"""The state around a call: traces, transforms, forward mode, tensor classes, forked processes.
+"""The state around a call: traces, transforms, forward mode, tensor classes, autocast, forks.
 
 The solver must be hidden from traces and transforms, which torch has no public way to detect. A
 test of each function fails if torch changes the internals that it reads.
@@ -6,18 +6,16 @@ test of each function fails if torch changes the internals that it reads.
 
 from __future__ import annotations
 
-import functools
 import os
-from collections.abc import Callable, Sequence
-from typing import Any, ParamSpec, TypeVar
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
-P = ParamSpec("P")
-R = TypeVar("R")
-_forked = False
 _functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue] - has no stub
 
 #: The tensor classes without a dispatch of their own.
@@ -73,30 +71,13 @@ def transforms() -> tuple[str, ...]:
 vars(transforms)["_dynamo_marked_constant"] = True
 
 
-def _mark() -> None:
-    global _forked
-    _forked = True
+def full_precision(like: Tensor) -> AbstractContextManager[object]:
+    """Return a context without autocast on the device of ``like``."""
+    device = like.device.type
+    if device == "meta" or not torch.is_autocast_enabled(device):
+        return nullcontext()
+    return torch.autocast(device, enabled=False)
 
 
-os.register_at_fork(after_in_child=_mark)
-
-
-def serially_if_forked(function: Callable[P, R]) -> Callable[P, R]:
-    """Run a function that the compiler may trace with one thread of torch in a forked child.
-
-    OpenMP's threads do not exist there, and torch would wait for them. The child's own number of
-    threads is restored.
-    """
-
-    @functools.wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
-        if not _forked:
-            return function(*args, **kwargs)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            return function(*args, **kwargs)
-        finally:
-            torch.set_num_threads(threads)
-
-    return wrapped
+# OpenMP's threads do not exist in a forked child, and torch would wait for them.
+os.register_at_fork(after_in_child=partial(torch.set_num_threads, 1))

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from tests.problems import expanded, known_qp, normal, programs_of, reduced_of, times
 from torch_qpmpc import Status, solve_qp
 from torch_qpmpc.mpc.layout import banded_matrix
-from torch_qpmpc.qp.pipeline.arrays import Theta, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs, Theta, to_tensor
 from torch_qpmpc.qp.pipeline.condensing import (
     SHIFT,
     Elimination,
@@ -155,7 +155,8 @@ def test_the_reduced_problem_is_the_problem_in_fewer_variables(batch, matrices):
     for seed in range(4):
         known = known_qp(seed, batch=batch, matrices=matrices if batch else ())
         p, reduced = programs_of(known), reduced_of(known)
-        data, qps = Theta._make(map(to_tensor, p.theta)), p.reduced_qps().in_torch()
+        data = Theta._make(map(to_tensor, p.theta))
+        qps = SoftQPs._make(map(to_tensor, p.reduced_qps()))
         H, G = data.H[p.group], data.G[p.group]
         v = normal(2, len(p), reduced.H.shape[-1], seed=seed)
         z = torch.stack([expanded(p, one) for one in v])

@@ -91,8 +91,8 @@ def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
 def test_linear_programs_with_bounds_that_are_far_away(seed):
     """Bounds of 1e3 to 1e20 beside others: no length follows from a cost without curvature."""
     programs = programs_of(zero_H(Draw(seed), 128).known).scaled()
-    answer = programs.recover(programs.reduced_qps().solved_by(interior_point.solve))
-    assert answer.accepted().all()
+    answer = programs.recover(interior_point.solve_arrays(programs.reduced_qps()))
+    assert (answer.status == 0).all()
 
 
 def test_multipliers_of_inactive_rows_are_zero():

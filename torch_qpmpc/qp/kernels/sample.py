@@ -520,7 +520,7 @@ def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
     """Solve QPs from active sets ``(B, n_g)``, corrected where needed; complete and certify them.
 
     Returns:
-        The parts of `BatchSolution`; the residual is infinite where no active set settled.
+        What `recover` does, and the numbers of sets; the residual is infinite where none settled.
     """
     d, r, w = reduced.H.shape[1], len(reduced.rows), reduced.w
     g_l_u = offsets(fixed, group, reduced.matrix, reduced.constant)
@@ -532,11 +532,9 @@ def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
     to_g, to_lam = sensitivities.to_g, sensitivities.to_lam
     v, lam, steps, done = _try_active_sets(to_g, to_lam, group, g, lower, upper, w, codes)
     passes = np.int64(0)  # Python's type: a literal 0 would be compiled once more
-    value, z, chi, lam, xi, codes, residual, error = recover(
-        v, lam, group, fixed, theta, reduced, sizes, passes
-    )
-    residual[~done] = np.inf
-    return value, z, chi, lam, xi, 0 * steps, residual, error, steps, codes
+    parts = recover(v, lam, group, fixed, theta, reduced, sizes, passes)
+    parts[6][~done] = np.inf
+    return parts, steps
 
 
 @compiled

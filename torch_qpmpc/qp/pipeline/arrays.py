@@ -79,19 +79,17 @@ class SoftQPs(NamedTuple):
         """Return the problems at ``index``, with the same matrices."""
         return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
 
-    def solved_by(self, solve: Callable[[SoftQPs], BackendSolution]) -> BackendSolution:
-        """Solve the QPs, unusually long ones in units of their own, powers of two.
+    def in_own_units(self, solve: Callable[[SoftQPs], BackendSolution]) -> BackendSolution:
+        """Solve QPs whose optimum may be far from zero in units of their own, powers of two.
 
-        An optimum far from zero is no match for a solver's absolute tolerances. It is no further
-        than without rows, and seldom than most bounds.
+        It is no match for a solver's absolute tolerances. It is no further than without rows, and
+        seldom than most bounds.
         """
-        if np.abs(self.g).max(initial=0.0) <= LONG * np.abs(self.H).max((1, 2), initial=0.0).min():
-            return BackendSolution._make(map(to_numpy, solve(self)))
         with np.errstate(all="ignore"):
             curvature = np.ldexp(1.0, np.frexp(np.abs(self.H).max((1, 2), initial=0.0))[1])
             size = np.abs(self.g).max(-1, initial=0.0) / curvature[self.group]
             if not ((size > LONG) & (size < np.inf)).any():
-                return BackendSolution._make(map(to_numpy, solve(self)))
+                return solve(self)
             near = (np.where(x != 0, np.abs(x), np.inf) for x in (self.l, self.u))
             near = np.minimum(*near) / np.linalg.norm(self.G, axis=-1)[self.group]
             size = np.minimum(size, np.median(near, axis=-1)) if near.shape[1] else size
@@ -99,15 +97,8 @@ class SoftQPs(NamedTuple):
         length = np.where(long, np.ldexp(1.0, np.frexp(size)[1]), 1.0)[:, None]
         force = curvature[self.group, None] * length
         parts = {"H": self.H / curvature[:, None, None], "g": self.g / force, "w": self.w / force}
-        scaled = self._replace(**parts, l=self.l / length, u=self.u / length)
-        v, lam, iterations = map(to_numpy, solve(scaled))
+        v, lam, iterations = solve(self._replace(**parts, l=self.l / length, u=self.u / length))
         return BackendSolution(v * length, lam * force, iterations)
-
-    def in_numpy(self) -> SoftQPs:
-        return SoftQPs._make(map(to_numpy, self))
-
-    def in_torch(self) -> SoftQPs:
-        return SoftQPs._make(map(to_tensor, self))
 
 
 class BackendSolution(NamedTuple):
@@ -127,7 +118,7 @@ class BackendSolution(NamedTuple):
 
 
 class BatchSolution(NamedTuple):
-    """Solutions of B QPs, see `QPSolution`; a candidate has status 0, and `accepted` judges it."""
+    """Solutions of B QPs, see `QPSolution`, or candidates, which are SOLVED or NOT_CONVERGED."""
 
     value: Array
     z: Array
@@ -140,13 +131,6 @@ class BatchSolution(NamedTuple):
     iterations: Array
     active: Array
 
-    def accepted(self) -> Array:
-        """Return the mask of solutions that the certificate accepts, ``(B,)``."""
-        return (self.residual <= TOLERANCE) & (self.value_error <= TOLERANCE)
-
-    def in_torch(self) -> BatchSolution:
-        return BatchSolution._make([torch.from_numpy(x) for x in self])
-
     def at(self, index: np.ndarray) -> BatchSolution:
         """Return copies of the solutions at ``index``."""
         return BatchSolution._make(x[index] for x in self)
@@ -156,17 +140,13 @@ class BatchSolution(NamedTuple):
         for own, new in zip(self, others, strict=True):
             own[index] = new
 
-    def proved(self) -> Array:
-        """Return the mask of QPs that are proved to have no solution, ``(B,)``."""
-        return (self.status == Status.INFEASIBLE) | (self.status == Status.UNBOUNDED)
-
     def improve(self, index: np.ndarray, others: BatchSolution) -> None:
-        """Replace solutions that are not accepted, at ``index``, by others that are better.
+        """Replace solutions that are not converged, at ``index``, by others that are better.
 
-        Those have a proof, are accepted, or have a smaller residual, which is what a refinement
-        starts from: an infinite error of the value may be due to rounding alone.
+        Those are solved, or proved to have no solution, or have a smaller residual, which is what a
+        refinement starts from: an infinite error of the value may be due to rounding alone.
         """
-        better = others.proved() | others.accepted() | (others.residual < self.residual[index])
+        better = (others.status != Status.NOT_CONVERGED) | (others.residual < self.residual[index])
         better = np.flatnonzero(better)
         self.put(index[better], others.at(better))
 

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.batching import broadcast
 from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.pipeline.arrays import (
+    TOLERANCE,
     BackendSolution,
     BatchSolution,
     SoftQPs,
@@ -42,7 +42,7 @@ from torch_qpmpc.qp.pipeline.condensing import (
     sizes,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
-from torch_qpmpc.qp.program import NDIMS, UNKNOWN
+from torch_qpmpc.qp.program import NDIMS, UNKNOWN, Status, broadcast
 
 T = TypeVar("T")
 #: The positions of H, C and G.
@@ -329,7 +329,7 @@ class Programs:
         The residual is infinite where a set does not.
         """
         sensitivities = self.prepared.sensitivities(self.n_f)
-        return BatchSolution(*sample.recall(active, sensitivities, *self._data()))
+        return certified(*sample.recall(active, sensitivities, *self._data()))
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -338,10 +338,7 @@ class Programs:
         elimination.
         """
         parts = sample.recover(candidate.v, candidate.lam, *self._data(), passes)
-        value, z, chi, lam, xi, active, residual, error = parts
-        steps = candidate.iterations
-        status = 0 * steps  # SOLVED, unless an error is too large
-        return BatchSolution(value, z, chi, lam, xi, status, residual, error, steps, active)
+        return certified(parts, candidate.iterations)
 
     def certify(
         self, z: np.ndarray, lam: np.ndarray, chi: np.ndarray, xi: np.ndarray
@@ -360,6 +357,14 @@ class Programs:
     def _data(self) -> tuple:
         prepared, n_f = self.prepared, self.n_f
         return self.group, self.fixed, self.theta, prepared.reduced(n_f), prepared.sizes(n_f)
+
+
+def certified(parts: Sequence[np.ndarray], iterations: np.ndarray) -> BatchSolution:
+    """Return the candidates of a kernel's parts; those with errors up to `TOLERANCE` are solved."""
+    value, z, chi, lam, xi, active, residual, error = parts
+    solved = (residual <= TOLERANCE) & (error <= TOLERANCE)
+    status = np.where(solved, int(Status.SOLVED), int(Status.NOT_CONVERGED))
+    return BatchSolution(value, z, chi, lam, xi, status, residual, error, iterations, active)
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

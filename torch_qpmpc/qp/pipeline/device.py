@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs, Theta, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.batch import Programs, certified
 from torch_qpmpc.qp.pipeline.condensing import Reduced, Sizes
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import interior_point
@@ -33,9 +33,7 @@ def attempt(programs: Programs, device: torch.device) -> BatchSolution:
     qps = reduced_qps(reduced, group, fixed)
     v, lam, iterations = interior_point.solve(qps)
     parts = sample_torch.recover(v, lam, group, fixed, theta, reduced, sizes)
-    value, z, chi, lam, xi, active, residual, error = map(to_numpy, parts)
-    steps = to_numpy(iterations)
-    return BatchSolution(value, z, chi, lam, xi, 0 * steps, residual, error, steps, active)
+    return certified([to_numpy(x) for x in parts], to_numpy(iterations))
 
 
 def on_device(programs: Programs, device: torch.device) -> tuple[Theta, Reduced, Sizes]:

@@ -122,7 +122,7 @@ class _QP(NamedTuple):
             contradiction, states = point.contradictions(slip)
             if not contradiction.any():
                 solution = point.judged(system.errors(x), sets)
-                return solution if solution.accepted() else None
+                return None if solution.status else solution
             codes = np.where(contradiction > 0, states, codes)
         return None
 
@@ -339,8 +339,11 @@ class _Point(NamedTuple):
         off *= TOLERANCE / CONTRADICTED
         residual = max(_ratio(np.abs(errors[: len(z) - n_f]), force), _ratio(off, short))
         xi = -(self.slope.high + qp.q + qp.G.T @ lam + qp.C.T @ chi)[:n_f]
-        settled = Status.SOLVED, residual, slip / scale, sets
-        return BatchSolution(cost + qp.c, z, chi, lam, xi, *settled, self.codes)
+        error = slip / scale
+        right = residual <= TOLERANCE and error <= TOLERANCE
+        status = int(Status.SOLVED if right else Status.NOT_CONVERGED)
+        certificate = status, residual, error, sets
+        return BatchSolution(cost + qp.c, z, chi, lam, xi, *certificate, self.codes)
 
 
 def _ratio(errors: np.ndarray, sizes: np.ndarray) -> float:

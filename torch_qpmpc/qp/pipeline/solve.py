@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextvars
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.qp.batching import broadcast, flatten_batch
+from torch_qpmpc.qp.batching import flatten_batch
 from torch_qpmpc.qp.pipeline.arrays import (
-    TOLERANCE,
+    LONG,
     BatchSolution,
     SoftQPs,
     to_numpy,
@@ -30,9 +30,8 @@ from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
 from torch_qpmpc.qp.pipeline.device import accelerator, attempt
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
-from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
+from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
-from torch_qpmpc.qp.tracing import serially_if_forked
 
 ON_FAILURE = ("raise", "warn", "mask")
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
@@ -97,7 +96,7 @@ class SolveLog:
 
     def add(self, solution: BatchSolution, seconds: float) -> None:
         """Count the ``solution`` of a batch, which took ``seconds``."""
-        accepted = solution.residual[solution.accepted()]
+        accepted = solution.residual[solution.status == Status.SOLVED]
         self.solves += len(solution.residual)
         self.unsolved += len(solution.residual) - len(accepted)
         self.iterations += int(solution.iterations.sum())
@@ -108,7 +107,6 @@ class SolveLog:
 _active_log: contextvars.ContextVar[SolveLog] = contextvars.ContextVar("log")
 
 
-@serially_if_forked
 def solve_now(*arguments: Any) -> BatchSolution:
     """Solve a batch; with ``solver="torch"``, the device of q makes the first attempt.
 
@@ -117,7 +115,6 @@ def solve_now(*arguments: Any) -> BatchSolution:
     """
     *theta, fixed, start, n_kept, solver, on_failure = arguments
     q = theta[1]
-    backend(solver)
     if on_failure not in ON_FAILURE:
         raise QPError.expected("on_failure", repr(on_failure), f"one of {', '.join(ON_FAILURE)}")
     device = accelerator(q) if solver == "torch" else None
@@ -139,7 +136,7 @@ def solve_now(*arguments: Any) -> BatchSolution:
     if on_failure != "mask" and solution.status.any():
         report(solution.status, batch, on_failure)
 
-    outputs = solution.in_torch()
+    outputs = BatchSolution._make(map(torch.from_numpy, solution))
     if len(batch) == 1 and q.dtype == torch.float64 and q.device == outputs.value.device:
         return outputs
 
@@ -212,7 +209,7 @@ class AtRest:
         solution, units = programs.scaled().recalled(self._active), self.prepared.units
         if units is not None:
             solution = units.restored(solution, programs.group)
-        if max(solution.residual[0], solution.value_error[0]) > TOLERANCE:
+        if solution.status[0]:
             return None
         self._active = solution.active
         return solution
@@ -248,7 +245,7 @@ def solve_programs(
     return solution
 
 
-def _solved(programs: Programs, steps: Iterator[Step], start: np.ndarray | None) -> BatchSolution:
+def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> BatchSolution:
     """Take the steps until each QP has a certified solution, or a proof that it has none."""
     count, solution, solvable = len(programs.group), None, programs.solvable()
     todo = np.arange(count) if solvable is None else solvable
@@ -265,41 +262,37 @@ def _solved(programs: Programs, steps: Iterator[Step], start: np.ndarray | None)
             solution.improve(todo, step(programs, solution))
         else:
             solution.improve(todo, step(programs.take(todo), solution.at(todo)))
-        solved = solution.accepted()
-        if solved.all():
-            return solution
-        todo = todo[~(solved | solution.proved())[todo]]
+        todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
     if solution is None:
         return programs.unsolved(Status.NOT_CONVERGED)
-    solution.status[todo] = Status.NOT_CONVERGED
-    unsolved = np.flatnonzero(~solution.accepted())
-    solution.clear(unsolved, programs.unsolved(solution.status))
+    if solution.status.any():
+        solution.clear(np.flatnonzero(solution.status), programs.unsolved(solution.status))
     return solution
 
 
 def steps_of(
     solver: str, log: SolveLog, warm: bool = False, device: torch.device | None = None
-) -> Iterator[Step]:
-    """Yield the steps of a solve, each for the QPs that the ones before leave.
+) -> list[Step]:
+    """Return the steps of a solve, each for the QPs that the ones before leave.
 
     Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
     them after other eliminations, which solve whole batches.
     """
-    if device:
-        yield partial(_tried, device)
-    if warm:
-        yield partial(_recalled, log)
-    yield backed(backend(solver))
+    first, *others, last = map(backed, (backend(solver), *fallbacks(solver)))
     refined = partial(_refined, log)
-    yield partial(_if_few, refined)
-    yield partial(_counted, log)
-    yield partial(_if_few, _diagnosed)
-    yield from (partial(_eliminated, way) for way in OTHER_ELIMINATIONS)
-    yield refined
-    yield _diagnosed
-    *others, last = map(backed, fallbacks(solver))
-    yield from others
-    yield partial(_refined_last, log, last)
+    return [
+        *([partial(_tried, device)] if device else []),
+        *([partial(_recalled, log)] if warm else []),
+        first,
+        partial(_if_few, refined),
+        partial(_counted, log),
+        partial(_if_few, _diagnosed),
+        *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
+        refined,
+        _diagnosed,
+        *others,
+        partial(_refined_last, log, last),
+    ]
 
 
 def backed(solve: Backend, passes: int = 0) -> Step:
@@ -307,7 +300,12 @@ def backed(solve: Backend, passes: int = 0) -> Step:
 
     def step(programs: Programs, _: Any) -> BatchSolution:
         qps = programs.reduced_qps()
-        answer = qps.solved_by(solve if qps.l.shape[-1] else _unconstrained)
+        run = solve if qps.l.shape[-1] else _unconstrained
+        steepest, flattest = (
+            np.abs(qps.g).max(initial=0.0),
+            np.abs(qps.H).max((1, 2), initial=0.0).min(),
+        )
+        answer = run(qps) if steepest <= LONG * flattest else qps.in_own_units(run)
         return programs.recover(answer, passes)
 
     return step
@@ -320,7 +318,7 @@ def _tried(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
 def _recalled(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
     """Solve from the candidates' active sets."""
     answer = programs.recalled(best.active)
-    log.recalled += int(answer.accepted().sum())
+    log.recalled += int((answer.status == Status.SOLVED).sum())
     return answer
 
 
@@ -337,7 +335,7 @@ def _refined_last(
 ) -> BatchSolution:
     """Refine the candidates of a step, whatever was refined before, and however large."""
     answer = step(programs, best)
-    left = np.flatnonzero(~answer.accepted())
+    left = np.flatnonzero(answer.status)
     log.refined += len(left)
     refine(programs, answer, left, last=True)
     return answer
@@ -366,6 +364,5 @@ def _eliminated(eliminate: Eliminate, programs: Programs, best: BatchSolution) -
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
     """Solve QPs without rows in closed form; the certificate rejects unbounded ones."""
-    H, _, group, g, lam, _, _ = qps.in_torch()
-    v = torch.einsum("bij,bj->bi", torch.linalg.pinv(H, hermitian=True)[group], -g)
-    return BackendSolution(v, lam, torch.zeros_like(group))
+    inverse = np.linalg.pinv(qps.H, hermitian=True)[qps.group]
+    return BackendSolution((inverse @ -qps.g[:, :, None])[:, :, 0], qps.l, np.zeros_like(qps.group))

@@ -30,7 +30,6 @@ SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000}
 
 def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch; in a large one, start each QP from the active set of a similar one."""
-    qps = qps.in_numpy()
     kinds = _alike(qps)
     if len(kinds) == 1:
         return _solve_alike(qps)

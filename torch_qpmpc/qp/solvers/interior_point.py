@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.kernels.batched import largest
-from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs, to_tensor
 from torch_qpmpc.qp.solution import row_states
 
 #: The largest absolute entry along the last dimension, which is kept.
@@ -236,11 +236,10 @@ def _newton_step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tenso
 
 @torch.no_grad()
 def solve(qps: SoftQPs) -> BackendSolution:
-    """Solve a batch on its own device.
+    """Solve a batch of tensors on their device.
 
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
-    qps = qps.in_torch()
     form = BatchedQPs.of(qps)
     point, todo = _begin(form), torch.arange(len(form), device=qps.g.device)
     unsolved = torch.full_like(form.cost, torch.inf)
@@ -256,6 +255,11 @@ def solve(qps: SoftQPs) -> BackendSolution:
         going = (~(last.residual <= SETTLED)).nonzero().squeeze(-1)
         form, point, todo = form.take(going), point.take(going), todo[going]
     return BackendSolution(best.v, best.lam, best.steps)
+
+
+def solve_arrays(qps: SoftQPs) -> BackendSolution:
+    """Solve a batch of arrays."""
+    return BackendSolution._make(x.numpy() for x in solve(SoftQPs._make(map(to_tensor, qps))))
 
 
 @dataclass

@@ -26,7 +26,6 @@ REFINEMENTS = 2
 
 def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch on torch's number of threads."""
-    qps = qps.in_numpy()
     form = SplitSlack.of(qps)
     n_qps = len(qps.group)
     batch = proxqp.sparse.BatchQP(n_qps)

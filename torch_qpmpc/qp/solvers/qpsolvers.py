@@ -93,7 +93,6 @@ def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
     """Solve the QPs one by one."""
     import qpsolvers
 
-    qps = qps.in_numpy()
     form = SplitSlack.of(qps)
     v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
     sparse = name in qpsolvers.sparse_solvers
