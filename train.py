@@ -4,7 +4,7 @@
     python train.py task=gros_zanon solver=daqp         another plant, in one long episode
     python train.py -m constraint=fixed,free seed=1,2   a sweep
     python train.py task=gymnasium task.id=Pendulum-v1 start=data   from a log, without a model
-    python train.py resume=FOLDER                       resume a stopped run
+    python train.py hydra.run.dir=FOLDER                repeat it to go on with a stopped run
     tensorboard --logdir runs                           watch the runs
 
 configs/ holds every key. The run's folder gets config.yaml, metrics.csv, TensorBoard events,
@@ -41,7 +41,13 @@ from torch_qpmpc.experiment.algorithms import (
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.launch import Interrupt, check_overrides, launched, settled
+from torch_qpmpc.experiment.launch import (
+    Interrupt,
+    check_overrides,
+    launched,
+    same_command,
+    settled,
+)
 from torch_qpmpc.experiment.metrics import (
     Tally,
     draw_outcome,
@@ -51,11 +57,11 @@ from torch_qpmpc.experiment.metrics import (
     update_metrics,
 )
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.code import COMMAND, named_task, resume_arguments
+from torch_qpmpc.experiment.tasks.code import named_task
 from torch_qpmpc.files import save_file
 from torch_qpmpc.mpc.state import KIND
 
@@ -112,7 +118,7 @@ def _train(
         stack.callback(collector.shutdown)
         after = None if state is None else state["update"]
         run = stack.enter_context(RunFolder(folder, cfg, after))
-        command = f"{COMMAND} {resume_arguments(run.path, cfg.task)}"
+        command = f"go on with {same_command(run.path)}"
 
         # Warm up, or resume.
         if state is None:
@@ -207,9 +213,11 @@ def _train(
 def _run(cfg: DictConfig) -> float:
     """Train, and return the closed gap, which an optimising sweeper can maximise."""
     with launched() as (folder, sweep):
-        cfg, state, summary = settled(cfg, folder, sweep)
+        state, summary = settled(cfg, folder, sweep)
         if summary is None:
             summary = train(cfg, folder, state, quiet=sweep)
+        elif not sweep:
+            print(f"\n{table(not_null(summary))}\n\n{folder}, which has finished before")
     return summary["closed_gap"]
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 from omegaconf import DictConfig
 
 import train
-from torch_qpmpc.experiment.run_state import resumed
+from torch_qpmpc.experiment.config import load_config
+from torch_qpmpc.experiment.launch import settled
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 
@@ -25,7 +27,7 @@ def stop(
     """Run or resume until ``update``, send a signal there, and return the exit code."""
     state = None
     if (folder / "config.yaml").exists():
-        cfg, state = resumed(folder, [])
+        cfg, state = begun(folder)
     left = update - (state["update"] if state else 0)
     entered = []
 
@@ -44,9 +46,17 @@ def stop(
     return ended.value.code
 
 
+def begun(folder: Path) -> tuple[DictConfig, dict[str, Any] | None]:
+    """Return the configuration and the state of a stopped run."""
+    cfg = load_config(folder / "config.yaml")
+    state, summary = settled(cfg, folder, sweep=False)
+    assert summary is None
+    return cfg, state
+
+
 def go_on(folder: Path) -> None:
     """Resume a stopped run and finish it."""
-    cfg, state = resumed(folder, [])
+    cfg, state = begun(folder)
     train.train(cfg, str(folder), state)
 
 

@@ -33,11 +33,11 @@ DATA = f"{FEW} start.transitions=200 task.start_episodes=2"
 SWEEP = f"{FEW} hydra.launcher.n_jobs=2 hydra.launcher.verbose=0"
 CASE = f"{SWEEP} constraint=fixed noise=gaussian"
 #: A run that is stopped at its first checkpoint.
+LONG = f"python train.py {' '.join(SMALL)} seed=71 updates=200 hydra.run.dir=runs/mine"
 STOPPED = (
-    "python train.py {run} & while [ ! -e {folder}/checkpoint.pt ]; do sleep 0.2; done; kill $!; "
-    "wait $! && exit 1; "
+    f"{LONG} & while [ ! -e runs/mine/checkpoint.pt ]; do sleep 0.2; done; kill $!; "
+    f"wait $! && exit 1; {LONG}"
 )
-LONG = " ".join(SMALL) + " seed=71 updates=200 eval_interval=10 hydra.run.dir={folder}"
 PENDULUM = "python train.py task=gymnasium task.id=Pendulum-v1 start=data"
 SCRIPT = "import runpy; print(runpy.run_path('docs/examples/torchrl/ddpg.py')['main'](2, seed=71))"
 
@@ -96,12 +96,7 @@ SHORT = {
         instead=f"python train.py start=data start.transitions=200 {FEW} hydra.run.dir=FOLDER && "
         f"python train.py start=data start.file=FOLDER/log.pt {FEW}"
     ),
-    "python train.py hydra.run.dir=runs/mine": Short(FEW),
-    "python train.py resume=runs/mine": Short(
-        instead="rm -r runs/mine; "
-        + STOPPED.format(folder="runs/mine", run=LONG.format(folder="runs/mine"))
-        + "python train.py resume=runs/mine"
-    ),
+    "python train.py hydra.run.dir=runs/mine": Short(instead=STOPPED),
     # Sweeps, and the tables of their folders.
     "python train.py -m constraint=fixed,free seed=1,2": Short(SWEEP),
     "python train.py -m constraint=fixed,free seed=1,2,3": Short(SWEEP),
@@ -122,13 +117,6 @@ SHORT = {
         FEW, files=MY_TASK
     ),
     "python my_task.py -m task=pole solver=daqp seed=1,2,3": Short(SWEEP, files=MY_TASK),
-    "python train.py resume=FOLDER task.file=my_task.py": Short(
-        instead=STOPPED.format(
-            folder="FOLDER", run="task.file=my_task.py " + LONG.format(folder="FOLDER")
-        )
-        + "python train.py resume=FOLDER task.file=my_task.py",
-        files=MY_TASK,
-    ),
     "python docs/examples/torchrl/ddpg.py": Short(instead=f'python -c "{SCRIPT}"'),
     # Benchmarks that can be shortened: one row of each.
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
@@ -173,7 +161,7 @@ SHORT = {
 #: Inline names of programs that are no commands.
 PROGRAMS = ("python -m torch_qpmpc.train", "python -m torch_qpmpc.report", "python -m tests...")
 #: Inline commands that a page's own ones stand for.
-TEMPLATES = ("python -m torch_qpmpc.report FOLDER", "python train.py resume=FOLDER")
+TEMPLATES = ("python -m torch_qpmpc.report FOLDER",)
 
 
 def commands(text: str) -> list[str]:

@@ -80,7 +80,7 @@ TRAIN = {
 )
 def test_train_commands_have_possible_settings(command, monkeypatch):
     monkeypatch.chdir(ROOT)  # of the paths of examples
-    overrides = [word for word in command if word != "-m" and not word.startswith("resume=")]
+    overrides = [word for word in command if word != "-m"]
     # Of a sweep, the first of each choice.
     first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
     check_config(make_config(*named_task(first)))

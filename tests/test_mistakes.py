@@ -32,7 +32,6 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
-from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step
@@ -240,11 +239,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("num_envs: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(0, 5, 1)),
     ("task.id: got NoneType, expected a str.", lambda: GymnasiumPlant(None)),
     ("max_steps: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(1, 0, 1)),
-    (
-        "resume: got /nonexistent, which does not exist, expected a run",
-        lambda: resumed("/nonexistent", []),
-    ),
-    ("resume: got None, expected a path.", lambda: resumed(None, [])),
 ]
 
 

@@ -86,8 +86,7 @@ def _plant(monkeypatch, known_starts):
     """Make the plant a lag, and fit the starts of the same settings and log once."""
 
     def once(cfg, physics, log):
-        settings = OmegaConf.masked_copy(cfg, [key for key in cfg if key != "resume"])
-        key = OmegaConf.to_yaml(settings), log["observation"].numpy().tobytes()
+        key = OmegaConf.to_yaml(cfg), log["observation"].numpy().tobytes()
         if key not in known_starts:
             known_starts[key] = candidates(cfg, physics, log)
         return copy.deepcopy(known_starts[key])
@@ -334,11 +333,11 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
     assert (cut / STARTS).read_bytes() == (whole / STARTS).read_bytes()
     (cut / STARTS).rename(tmp_path / STARTS)
     with pytest.raises(SystemExit, match=r"starts\.csv: got .*No such file.* Start a new run"):
-        run_command(f"resume={cut}")
+        run_command(*DATA, *settings, f"hydra.run.dir={cut}")
     (tmp_path / STARTS).rename(cut / STARTS)
     with monkeypatch.context() as patch:
         patch.setattr("torch_qpmpc.experiment.start.choose", None)
-        run_command(f"resume={cut}")
+        run_command(*DATA, *settings, f"hydra.run.dir={cut}")
     resumed = FinishedRun(cut)
     constants = [x.policy.c.item() for x in (run, resumed)]
     assert constants[0] != run.start.c.item(), "it is corrected after the warm-up"

@@ -127,7 +127,7 @@ def test_a_run_stops_cleanly_wherever_the_signal_comes(
         with pytest.raises(SystemExit) as ended:
             train.train(make_config(*RUN), str(folder))
     assert ended.value.code == 128 + signum
-    sentence = f"Stopped {said}: python train.py resume={folder}"
+    sentence = f"Stopped {said}: go on with python train.py hydra.run.dir={folder}"
     assert capsys.readouterr().out.splitlines()[-1] == sentence
     assert (folder / "checkpoint.pt").exists() == ("after" in said)
     go_on(folder)

@@ -130,7 +130,7 @@ def test_a_failed_write_is_reported(tmp_path):
     with pytest.raises(QPError, match=r"writing failed .* folder. Choose another folder with hydr"):
         raise unwritable(tmp_path, error)
     (tmp_path / "checkpoint.pt").touch()
-    with pytest.raises(QPError, match=f"free space, then python train.py resume={tmp_path}.$"):
+    with pytest.raises(QPError, match=f"then repeat the command with hydra.run.dir={tmp_path}.$"):
         raise unwritable(tmp_path, error)
 
 

@@ -14,9 +14,8 @@ from omegaconf import OmegaConf
 
 import train
 from tests.runs import SMALL, make_config
-from tests.stops import assert_same_numbers, go_on, stop
+from tests.stops import assert_same_numbers, begun, go_on, stop
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.run_state import resumed
 from torch_qpmpc.files import load_file, save_file
 from torch_qpmpc.mpc.state import KIND
 
@@ -120,24 +119,13 @@ def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkey
 # --- What is refused -----------------------------------------------------------------------------
 
 
-def test_only_a_stopped_run_resumes(tmp_path, stopped):
-    message = r"resume: got it together with seed=3, expected no other override"
-    with pytest.raises(QPError, match=message):
-        resumed(stopped, ["resume=x", "seed=3"])
-    with pytest.raises(QPError, match=r"resume: got .*without config.yaml, expected a run's"):
-        resumed(tmp_path, [])
-    (stopped / "summary.json").touch()
-    with pytest.raises(QPError, match=r"resume: got .*which is finished, expected a stopped run"):
-        resumed(stopped, [])
-
-
 def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
     state = load_file(stopped / "checkpoint.pt", KIND)
     state["config"] |= {"release": None}
     save_file(stopped / "checkpoint.pt", KIND, state)
     with (stopped / "config.yaml").open("a") as file:
         file.write("release: null\n")
-    cfg, state = resumed(stopped, [])
+    cfg, state = begun(stopped)
     train.train(cfg, str(stopped), state)
     assert_same_numbers(stopped, whole)
 
@@ -147,10 +135,10 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     state = {name: part for name, part in whole.items() if name != "config"}
     save_file(stopped / "checkpoint.pt", KIND, state)
     with pytest.raises(QPError, match="checkpoint: got a saved QPMPC, expected a run's state"):
-        resumed(stopped, [])
+        begun(stopped)
     torch.save([1, 2], stopped / "checkpoint.pt")
     with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which another program wrote"):
-        resumed(stopped, [])
+        begun(stopped)
     cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2")
     save_file(stopped / "checkpoint.pt", KIND, whole)
     OmegaConf.save(cfg, stopped / "config.yaml", resolve=True)
@@ -158,7 +146,7 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
         r"checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's seed=2"
     )
     with pytest.raises(QPError, match=message):
-        resumed(stopped, [])
+        begun(stopped)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +163,7 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     ],
 )
 def test_a_part_that_does_not_fit_is_named(stopped, part, change):
-    cfg, state = resumed(stopped, [])
+    cfg, state = begun(stopped)
     assert state is not None
     state[part].update(change)
     with pytest.raises(QPError, match=rf"checkpoint: got '{part}' that does not fit \(.*the state"):

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
-from tests.runs import SMALL, make_config, run_command
-from torch_qpmpc import QPError
-from torch_qpmpc.experiment.launch import (
-    finished_run,
-    locked,
-    sub_folder,
-)
+from tests.runs import SMALL, run_command
+from torch_qpmpc.experiment.launch import locked, sub_folder
 
 ROOT = Path(__file__).parents[2]
 #: The settings of each launcher but `cores`, which test_docs.py runs.
@@ -76,6 +71,9 @@ def test_a_sweep_resumes(tmp_path, capsys):
     before = (first / "checkpoint.pt").stat().st_mtime_ns
     (second / "tensorboard").mkdir(parents=True)
     (second / "tensorboard" / "stale").touch()
+    shutil.copy(first / "config.yaml", second)
+    settings = (second / "config.yaml").read_text()
+    (second / "config.yaml").write_text(settings.replace("seed: 1\n", "seed: 2\n", 1))
 
     sweep(tmp_path, "seed=1,2")
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
@@ -85,8 +83,8 @@ def test_a_sweep_resumes(tmp_path, capsys):
     with pytest.raises(SystemExit) as changed:
         sweep(tmp_path, "seed=1", "exploration_std=0.2")
     assert changed.value.code == 1
-    sentence = "a finished run with exploration_std=0.3, expected exploration_std=0.2"
-    assert sentence in capsys.readouterr().err
+    sentence = "holds a run with exploration_std=0.3, expected exploration_std=0.2. Choose another"
+    assert f"{sentence} folder with hydra.sweep.dir=FOLDER." in capsys.readouterr().err
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
 
 
@@ -107,29 +105,3 @@ def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
     name = sub_folder("seed1", "+ablation=sdp,a.b={c: 1}")
     assert name == "seed1-ablation=sdp,a.b=_c_1_"
     assert sub_folder("seed1", "") == "seed1"
-
-
-# --- Runs that have finished ---------------------------------------------------------------------
-
-
-OUTCOME = {"seed": 1, "closed_gap": 0.5, "J_start": 2.0, "J_final": 1.5, "J_best": 1.5}
-OUTCOME |= {"J_true_model": None, "canonical_distance": None}
-
-
-@pytest.fixture
-def finished(tmp_path: Path) -> Path:
-    OmegaConf.save(make_config(*SMALL), tmp_path / "config.yaml", resolve=True)
-    (tmp_path / "summary.json").write_text(json.dumps(OUTCOME))
-    return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("override", "difference"),
-    [
-        ("seed=2", r"seed=1, expected seed=2"),
-        ("constraint=si", r"constraint.name=identified, .* expected constraint.name=si,"),
-    ],
-)
-def test_other_settings_are_another_run(finished, override, difference):
-    with pytest.raises(QPError, match=f"a finished run with .*{difference}.*hydra.sweep.dir"):
-        finished_run(finished, make_config(*SMALL, override))

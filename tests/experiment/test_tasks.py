@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import runpy
-import shlex
 import signal
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from pydantic import Field
 
 import train
@@ -34,7 +32,7 @@ from torch_qpmpc.experiment.tasks import (
     register,
     run_code,
 )
-from torch_qpmpc.experiment.tasks.code import named_code, named_task, resume_arguments
+from torch_qpmpc.experiment.tasks.code import named_task
 from torch_qpmpc.mpc.layout import banded_matrix
 
 
@@ -279,7 +277,7 @@ def test_the_command_line_may_name_a_script_alone(own_task, tmp_path):
     alone = [f"task.file={file}", "seed=2"]
     assert named_task(alone) == ["task=mine", *alone]
     assert make_config("task=mine").constraint.name == "mpc"
-    for unchanged in (["seed=2"], [f"task.file={file}", "task=mine"], ["task.file=x", "resume=x"]):
+    for unchanged in (["seed=2"], [f"task.file={file}", "task=mine"]):
         assert named_task(unchanged) == unchanged
     empty = tmp_path / "empty.py"
     empty.write_text("")
@@ -293,13 +291,12 @@ def test_the_command_line_may_name_a_script_alone(own_task, tmp_path):
 
 
 def test_a_task_without_its_code_has_no_plant(own_task):
-    file = own_task("")
+    own_task("")
     cfg = make_config("task=mine")
     del TASKS["mine"]
     message = r"task\.file: got '.*mine\.py', which has not run, expected a script that has regis"
     with pytest.raises(QPError, match=message):
         make_physics(cfg)
-    assert named_code(cfg.task) == {"task.file": file}
 
 
 def test_an_environment_of_a_module_needs_its_import():
@@ -308,15 +305,11 @@ def test_an_environment_of_a_module_needs_its_import():
     with pytest.raises(QPError, match=message):
         make_physics(cfg)
     assert "antigravity" not in sys.modules
-
-
-def test_the_arguments_that_resume_are_quoted():
-    task = {"name": "mine", "file": "/a b/it's.py"}
-    words = shlex.split(resume_arguments("runs/1", task))
-    assert words == ["resume=runs/1", 'task.file="/a b/it\'s.py"']
-    (override,) = OverridesParser.create().parse_overrides(words[1:])
-    assert override.value() == "/a b/it's.py"
-    assert resume_arguments("runs/1", {"name": "point_mass", "file": "x.py"}) == "resume=runs/1"
+    message = (
+        r"task\.id: got 'greenhouse:Id-v0', and cannot import greenhouse \(No module .* Start "
+    )
+    with pytest.raises(QPError, match=message):
+        run_code(make_config("task=pendulum", "task.id=greenhouse:Id-v0").task)
 
 
 def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
@@ -326,7 +319,7 @@ def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
     train.train(cfg, str(whole), quiet=True)
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     del TASKS["mine"]
-    run_command(f"resume={cut}", f"task.file={file}")
+    run_command(f"task.file={file}", *SMALL, f"hydra.run.dir={cut}")
     assert_same_numbers(cut, whole)
 
 

@@ -1,9 +1,9 @@
 """Kill and resume runs: ``python -m tests.faults.kill --count 20``.
 
 SIGKILL comes at seeded random moments: while the run starts, between two updates, or while a
-checkpoint is written. Each run is resumed by ``train.py resume=FOLDER`` until it has finished, and
-must have the numbers of an undisturbed run. The processes are forks of this one, which has imported
-everything, so that they start within a second.
+checkpoint is written. Each run goes on by the same command until it has finished, and must have the
+numbers of an undisturbed run. The processes are forks of this one, which has imported everything,
+so that they start within a second.
 """
 
 from __future__ import annotations
@@ -60,10 +60,7 @@ def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, 
 
 def start(place: Path, settings: tuple[str, ...]) -> Process:
     """Start a process that begins or resumes the run in ``place``."""
-    if (place / "config.yaml").exists():
-        settings = (f"resume={place}",)
-    else:
-        settings = (*settings, f"hydra.run.dir={place}")
+    settings = (*settings, f"hydra.run.dir={place}")
     process = multiprocessing.get_context("fork").Process(target=command, args=(settings,))
     process.start()
     return process

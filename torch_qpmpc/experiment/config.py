@@ -133,7 +133,6 @@ class Config(Group):
     step: Annotated[
         Literal["cholesky", "projection", "sdp"], AfterValidator(lambda x: check_step(x) or x)
     ]
-    resume: str | None
     ablation: str | None
     gate: Literal["act", "plant"] | bool
     gate_bound: Positive | None

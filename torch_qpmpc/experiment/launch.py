@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
+import shlex
 import shutil
 import signal
 import threading
@@ -28,56 +28,60 @@ from torch_qpmpc.experiment.config import (
     settings,
     unknown_key,
 )
-from torch_qpmpc.experiment.run_folder import read_summary, unwritable
-from torch_qpmpc.experiment.run_state import (
-    check_fresh,
-    configured,
-    load_state,
-    resumed,
-)
-from torch_qpmpc.experiment.tasks import run_code
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, read_summary, unwritable
+from torch_qpmpc.experiment.run_state import load_state
+from torch_qpmpc.experiment.tasks.code import COMMAND, run_code
 
 #: The locked file of a run's folder.
 LOCK = ".lock"
-# For hydra.run.dir in configs/config.yaml: a resumed run keeps its folder.
-OmegaConf.register_new_resolver("folder_of", lambda old, new: str(Path(old or new)), replace=True)
 
 
 def settled(
-    cfg: DictConfig, folder: str, sweep: bool
-) -> tuple[DictConfig, dict[str, Any] | None, dict[str, Any] | None]:
-    """Decide between a new run in ``folder``, one to resume, and a finished one of a ``sweep``.
+    cfg: DictConfig, folder: str | Path, sweep: bool
+) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
+    """Decide between a new run in ``folder``, one that goes on, and a finished one.
 
-    Return the configuration, the state to resume from or None, and a finished run's summary or
-    None; raise `QPError` for an invalid configuration, or if the folder holds another run.
+    Returns:
+        The state to go on from, or None; the summary of a finished run, or None.
+
+    Raises:
+        QPError: the configuration is invalid, or the folder holds a run with another one.
     """
-    resume, state = cfg.resume, None
-    if resume is None:
-        run_code(cfg.task)
-    else:
-        own = cfg.task.get("file")
-        cfg, state = resumed(resume, HydraConfig.get().overrides.task)
-        run_code({**cfg.task, "file": own})
+    run_code(cfg.task)
     check_config(cfg)
-    if sweep:
-        if (summary := finished_run(folder, cfg)) is not None:
-            return cfg, None, summary
-        state = stopped_run(folder, cfg)
-    elif resume is None:
-        check_fresh(folder)
-    elif Path(resume).resolve() != Path(folder).resolve():
-        remedy = "A run resumes in its own folder: omit hydra.run.dir, or copy the folder first."
-        raise QPError.expected("folder", f"{folder} with resume={resume}", resume, remedy)
-    return cfg, state, None
+    folder = Path(folder)
+    config, remedy = folder / "config.yaml", f"Choose another folder with {_key(sweep)}=FOLDER."
+    if not config.exists():
+        if any((folder / name).exists() for name in ("metrics.csv", CHECKPOINT, "summary.json")):
+            got = f"{folder}, which holds a run without its config.yaml"
+            raise QPError.expected("folder", got, "a run's folder, or one without a run", remedy)
+        return None, None
+    if changed := differences(settings(load_config(config)), settings(cfg)):
+        then, now = changed
+        raise QPError.expected("folder", f"{folder}, which holds a run with {then}", now, remedy)
+    if (folder / "summary.json").exists():
+        return None, read_summary(folder)
+    if (folder / CHECKPOINT).exists():
+        return load_state(folder, cfg), None
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of a run that begins anew
+    return None, None
+
+
+def same_command(folder: str | Path) -> str:
+    """Return the command line of this process for the run in ``folder``, to go on with it."""
+    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    return f"{COMMAND} {shlex.join([*given, f'hydra.run.dir={folder}'])}"
+
+
+def _key(sweep: bool) -> str:
+    return f"hydra.{'sweep' if sweep else 'run'}.dir"
 
 
 def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
-    """Raise `QPError` for an unknown key, for which Hydra advises a +, or no run to resume."""
+    """Raise `QPError` for an unknown key, for which Hydra advises a +."""
     known, groups = [*keys()], {path.name for path in Path(configs).iterdir() if path.is_dir()}
     for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key == "resume" and value != "null":
-            configured(value.strip("'\""))  # before Hydra makes the run's folder
+        key = argument.partition("=")[0]
         plain = "=" in argument and re.fullmatch(r"\w+(\.\w+)*", key)
         if not plain or key in groups or key.startswith("hydra."):
             continue
@@ -95,7 +99,7 @@ def launched() -> Iterator[tuple[str, bool]]:
     sweep = hydra.mode is RunMode.MULTIRUN
     folder = hydra.runtime.output_dir
     try:
-        with locked(folder, f"hydra.{'sweep' if sweep else 'run'}.dir=FOLDER"):
+        with locked(folder, f"{_key(sweep)}=FOLDER"):
             yield folder, sweep
     except (QPError, OSError) as error:
         if sweep:
@@ -152,31 +156,6 @@ class Interrupt:
     def _note(self, signum: int, frame: object) -> None:
         self.signum = signum
         self.__exit__()
-
-
-def finished_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
-    """Read the summary of the run in ``folder``; return None if the run has not finished."""
-    folder = Path(folder)
-    if not (folder / "summary.json").exists():
-        return None
-    saved = settings(load_config(folder / "config.yaml"))
-    if changed := differences(saved, settings(cfg)):
-        then, now = changed
-        remedy = "Remove it, or choose another folder with hydra.sweep.dir=FOLDER."
-        raise QPError.expected(f"{folder}", f"a finished run with {then}", now, remedy)
-    return read_summary(folder)
-
-
-def stopped_run(folder: str | Path, cfg: DictConfig) -> dict[str, Any] | None:
-    """Return the state from which the run in ``folder`` can go on, or None to begin anew.
-
-    In that case its files for TensorBoard are removed.
-    """
-    folder = Path(folder)
-    with contextlib.suppress(QPError):
-        return load_state(folder, cfg)
-    shutil.rmtree(folder / "tensorboard", ignore_errors=True)
-    return None
 
 
 class SubFolders(Callback):

@@ -16,7 +16,6 @@ from torchrl.record.loggers import Logger, get_logger
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import load_config, settings
-from torch_qpmpc.experiment.tasks.code import COMMAND
 from torch_qpmpc.files import damaged, write_whole
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -52,10 +51,10 @@ class RunFolder:
         earlier: Any = () if after is None else read_metrics(self.path).loc[:after].iterrows()
         self.rows: list[dict[str, float]] = [{"update": k, **row.dropna()} for k, row in earlier]
         self.cfg = cfg
-        self.logger = make_logger(cfg, self.path)
         if after is None:
             text = OmegaConf.to_yaml(cfg, resolve=True)
             write_whole(self.path / "config.yaml", text.encode())
+        self.logger = make_logger(cfg, self.path)
 
     def __enter__(self) -> RunFolder:
         return self
@@ -121,7 +120,7 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
-        remedy = "Resume from a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
+        remedy = "Go on in a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
         raise damaged(file, error, "the table that a run wrote", remedy) from error
 
 
@@ -129,7 +128,7 @@ def read_summary(folder: str | Path) -> dict[str, Any]:
     """Read a finished run's summary.json; raise `QPError` if it is missing or damaged."""
     file = Path(folder) / "summary.json"
     if file.with_name(CHECKPOINT).exists() and not file.exists():
-        remedy = f"Finish it: {COMMAND} resume={folder}."
+        remedy = f"Finish it: repeat its command with hydra.run.dir={folder}."
         raise QPError.expected("folder", f"{folder}, with a stopped run", "a finished run", remedy)
     try:
         summary = json.loads(file.read_text(encoding="utf-8"))
@@ -139,6 +138,13 @@ def read_summary(folder: str | Path) -> dict[str, Any]:
         return summary
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise damaged(file, error, "the outcome that a run wrote") from error
+
+
+def not_null(value: Any) -> Any:
+    """Replace None by nan, as before `RunFolder.finish`."""
+    if isinstance(value, Mapping):
+        return {key: not_null(entry) for key, entry in value.items()}
+    return math.nan if value is None else value
 
 
 def _finite(value: Any) -> Any:
@@ -153,6 +159,7 @@ def unwritable(folder: str | Path, error: OSError) -> QPError:
     checkpoint = Path(folder) / CHECKPOINT
     remedy = "Choose another folder with hydra.run.dir=FOLDER."
     if checkpoint.exists():
-        remedy = f"{checkpoint} is intact: free space, then {COMMAND} resume={folder}."
+        remedy = f"{checkpoint} is intact: free space, then repeat the command with "
+        remedy += f"hydra.run.dir={folder}."
     got = f"{folder}, where writing failed ({error})"
     return QPError.expected("folder", got, "a writable folder", remedy)

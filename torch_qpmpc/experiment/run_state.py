@@ -6,8 +6,7 @@ environments cannot be saved and start new episodes.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,14 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.config import differences, load_config, settings
+from torch_qpmpc.experiment.config import differences, settings
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
-from torch_qpmpc.experiment.tasks.code import COMMAND, has_run, named_code, resume_arguments
 from torch_qpmpc.files import load_file
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.state import KIND, stored
-
-#: Files that a run writes before its first checkpoint.
-WRITTEN = ("config.yaml", "metrics.csv")
 
 
 def snapshot(
@@ -99,7 +94,11 @@ def restore(
 
 
 def load_state(folder: Path, cfg: DictConfig) -> dict[str, Any]:
-    """Load the last `snapshot` of the run in a folder, which has the configuration ``cfg``."""
+    """Load the last `snapshot` of the run in a folder, which has the configuration ``cfg``.
+
+    Raises:
+        QPError: the file is damaged, or of a run with another configuration.
+    """
     state = load_file(folder / CHECKPOINT, KIND, "train.py")
     if "config" not in state:
         raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
@@ -110,69 +109,6 @@ def load_state(folder: Path, cfg: DictConfig) -> dict[str, Any]:
             "checkpoint", f"one from a run with {then}", f"config.yaml's {now}", remedy
         )
     return state
-
-
-def resumed(path: str | Path, overrides: Collection[str]) -> tuple[DictConfig, dict | None]:
-    """Load a stopped run's configuration and last state, or None before its first checkpoint.
-
-    Beside the run's folder ``path``, the command line's ``overrides`` may only name the code that
-    the run needs, as in ``task.file=FILE``.
-    """
-    given = {key: text.strip("'\"") for key, _, text in (x.partition("=") for x in overrides)}
-    cfg, state = _stopped(path)
-    code = named_code(cfg.task)
-    if others := given.keys() - {"resume", *code, *(["task"] if "task.id" in code else [])}:
-        got = f"it together with {', '.join(f'{key}={given[key]}' for key in sorted(others))}"
-        remedy = "A run resumes with its own configuration."
-        raise QPError.expected("resume", got, "no other override", remedy)
-    # Another script may register the task, as on another computer, but not another environment.
-    same = code.keys() <= given.keys() and given.get("task.id") == code.get("task.id")
-    if not (same or has_run(cfg.task)):
-        words = ", ".join(f"{key}={value!r}" for key, value in code.items())
-        words += f" with task.kwargs={cfg.task.kwargs}" if cfg.task.get("kwargs") else ""
-        got = f"{path}, whose config.yaml names code ({words})"
-        command = f"{COMMAND} {resume_arguments(path, cfg.task)}"
-        remedy = f"Read that code, which may not be yours; to run it: {command}"
-        raise QPError.expected("resume", got, "code that the command line names, too", remedy)
-    return cfg, state
-
-
-def _stopped(path: str | Path) -> tuple[DictConfig, dict | None]:
-    """Load a stopped run's configuration and last state as data."""
-    config, path = configured(path), Path(path)
-    if (path / "summary.json").exists():
-        raise QPError.expected("resume", f"{path}, which is finished", "a stopped run")
-    cfg = load_config(config)
-    return cfg, load_state(path, cfg) if (path / CHECKPOINT).exists() else None
-
-
-def configured(path: str | Path) -> Path:
-    """Return config.yaml of the run in the folder ``path``."""
-    if not isinstance(path, str | Path):
-        raise QPError.expected("resume", repr(path), "a path")
-    config = Path(path) / "config.yaml"
-    if not config.exists():
-        wrong = "without config.yaml" if Path(path).exists() else "which does not exist"
-        raise QPError.expected("resume", f"{path}, {wrong}", "a run's folder")
-    return config
-
-
-def check_fresh(folder: str | Path) -> None:
-    """Raise `QPError` if ``folder`` already holds a run, finished or stopped."""
-    folder = Path(folder)
-    remedy = "Choose another folder with hydra.run.dir=FOLDER."
-    if (folder / "summary.json").exists():
-        got = "which holds a finished run"
-    elif any((folder / name).exists() for name in (*WRITTEN, CHECKPOINT)):
-        got = "which holds a stopped run"
-        with contextlib.suppress(Exception):  # damaged files raise errors of any type
-            arguments = resume_arguments(folder, _stopped(folder)[0].task)
-            remedy = (
-                f"Resume it with {arguments}, or choose another folder with hydra.run.dir=FOLDER."
-            )
-    else:
-        return
-    raise QPError.expected("folder", f"{folder}, {got}", "one without a run", remedy)
 
 
 def _collector_state(collector: Collector) -> dict[str, Any] | None:

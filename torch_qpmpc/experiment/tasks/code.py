@@ -9,7 +9,6 @@ import importlib
 import importlib.util
 import re
 import runpy
-import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,21 +22,6 @@ from torch_qpmpc.experiment.tasks.registry import TASKS
 from torch_qpmpc.files import PACKAGED
 
 
-def named_code(task: Mapping[str, Any]) -> dict[str, str]:
-    """Return the keys under ``task`` that name code, with their values.
-
-    They are ``task.file``, except with a built-in task, and ``task.id`` if it or a string in
-    ``task.kwargs`` has the form ``module:Id``, whose module Gymnasium imports.
-    """
-    known, file = TASKS.get(str(task.get("name"))), task.get("file")
-    code = {}
-    if isinstance(file, str) and not (known is not None and known.defaults is None):
-        code["task.file"] = file
-    if modules(task):
-        code["task.id"] = str(task["id"])
-    return code
-
-
 def modules(task: Mapping[str, Any]) -> list[str]:
     """Return the importable modules that a Gymnasium environment's id and arguments name."""
     if task.get("name") != "gymnasium":
@@ -48,34 +32,38 @@ def modules(task: Mapping[str, Any]) -> list[str]:
 
 def has_run(task: Mapping[str, Any]) -> bool:
     """Return True if all code that ``task`` names has been run in this process."""
-    code = named_code(task)
-    registered = "task.file" not in code or str(task.get("name")) in TASKS
-    return registered and {*modules(task)} <= {*sys.modules}
+    return str(task.get("name")) in TASKS and {*modules(task)} <= {*sys.modules}
 
 
 def run_code(task: Mapping[str, Any]) -> None:
     """Run the script and import the modules that ``task`` names: the command line's own."""
-    name, file = task.get("name"), named_code(task).get("task.file")
-    if file is None and task.get("file") is not None and name in TASKS:
-        got = f"{task['file']!r} with task={name}, which reads no file"
-        remedy = "Leave out task to learn the one that the file registers."
-        raise QPError.expected("task.file", got, "a task with a file", remedy)
+    name, file = str(task.get("name")), task.get("file")
     if file is not None and name not in TASKS:
         expected = f"the Python file that registers task={name}"
-        if name not in _registered_by(file, expected):
+        if name not in _registered_by(str(file), expected):
             raise QPError.expected("task.file", f"{file!r}, which registers no {name!r}", expected)
-    for module in modules(task):
-        importlib.import_module(module)
+    elif file is not None and TASKS[name].defaults is None:
+        got = f"{file!r} with task={name}, which reads no file"
+        remedy = "Leave out task to learn the one that the file registers."
+        raise QPError.expected("task.file", got, "a task with a file", remedy)
+    own, colon, _ = str(task.get("id", "")).partition(":")
+    for module in [*([own] if colon else []), *modules(task)]:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            got = f"{task['id']!r}, and cannot import {module} ({error})"
+            remedy = "Start in the folder that has it, or install it."
+            raise QPError.expected("task.id", got, "MODULE:ID with a module", remedy) from error
 
 
 def named_task(arguments: Sequence[str]) -> list[str]:
     """Return the command line with ``task=NAME`` of the script in ``task.file=FILE``, which is run.
 
-    A command line that names a task or resumes a run is returned unchanged.
+    A command line that names a task is returned unchanged.
     """
     named = {key: value for key, _, value in (x.partition("=") for x in arguments)}
     file = named.get("task.file")
-    if file is None or "resume" in named:
+    if file is None:
         return [*arguments]
     file = str(OverridesParser.create().parse_override(f"task.file={file}").value())
     expected = "a Python file that registers one task"
@@ -102,16 +90,6 @@ def _registered_by(file: str, expected: str) -> list[str]:
 
 #: How train.py is started: by its path in a clone, and as a module from a wheel.
 COMMAND = "python -m torch_qpmpc.train" if PACKAGED.exists() else "python train.py"
-
-
-def resume_arguments(folder: str | Path, task: Mapping[str, Any]) -> str:
-    """Return the command line's arguments that resume the run in ``folder``."""
-    code = named_code(task)
-    words = [f"resume={folder}", *(["task=gymnasium"] if "task.id" in code else [])]
-    for key, value in code.items():
-        plain = re.fullmatch(r"[\w./:-]+", value)
-        words.append(f"{key}={value}" if plain else shlex.quote(f'{key}="{value}"'))
-    return " ".join(words)
 
 
 def _strings(value: Any) -> Iterator[str]:
