@@ -106,8 +106,7 @@ def read(
         >>> import torch, torch_qpmpc as qm
         >>> from torch_qpmpc.analysis.report import read
         >>> A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]), torch.tensor([[0.0], [0.1]])
-        >>> mpc = qm.QPMPC.from_model(A, B, 10, stage_weight=[1.0] * 3, hessian="block")
-        >>> reading = read(mpc)
+        >>> reading = read(qm.QPMPC.from_model(A, B, 9, stage_weight=[1.0] * 3, hessian="block"))
         >>> reading.distance_to_mpc < 1e-9, round(reading.radius_predicted, 2)
         (True, 0.97)
     """

@@ -53,8 +53,9 @@ class Export:
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
-        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
+        >>> mpc = qm.QPMPC.from_model(
+        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
+        ... )
         >>> export = qm.export_c(mpc, tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
         (['policy.h', 'policy.c'], 3)
@@ -232,10 +233,11 @@ class CompiledPolicy:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
-        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
+        >>> mpc = qm.QPMPC.from_model(
+        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
+        ... )
         >>> policy = qm.CompiledPolicy(mpc)
-        >>> s = torch.tensor([[1.0, 0.0], [-0.5, 0.3]])
+        >>> s = torch.tensor([[1.0], [-0.5]])
         >>> torch.allclose(policy(s), mpc.policy(s))
         True
     """

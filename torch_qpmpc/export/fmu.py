@@ -71,8 +71,9 @@ def export_fmu(
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> A, B, box = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], ([-1.0], [1.0])
-        >>> mpc = qm.QPMPC.from_model(A, B, 3, stage_weight=[1.0, 1.0, 0.1], action_bounds=box)
+        >>> mpc = qm.QPMPC.from_model(
+        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
+        ... )
         >>> export = qm.export_fmu(mpc, tempfile.mkdtemp() + "/policy.fmu")
         >>> [file.name for file in export.files]
         ['policy.fmu']
