@@ -17,7 +17,7 @@ from torch import Tensor
 from tests.benchmarks.table import DOCS, replaced, table
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QuadraticProgram, solve_qp
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
+from torch_qpmpc.qp.program import TOLERANCE
 from torch_qpmpc.qp.solvers import BACKENDS
 
 PAGE = DOCS / "reliability" / "measured.md"

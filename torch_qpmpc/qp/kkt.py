@@ -15,9 +15,9 @@ from torch import Tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, flatten_batch, schema, times
 from torch_qpmpc.qp.kernels.batched import hold, largest, multiply
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, Status, broadcast
+from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
 from torch_qpmpc.qp.solution import active_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
 

@@ -263,6 +263,8 @@ UNKNOWN = 127
 
 #: An upper bound of this size, or a lower one of minus this, counts as infinite.
 INFINITE = 1e20
+#: The certificate rejects a solution with a larger relative residual or error of its value.
+TOLERANCE = 1e-6
 #: Bounds that cross by at most this many machine epsilons are equal.
 CROSSING = 4.0
 

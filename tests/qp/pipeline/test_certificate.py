@@ -12,9 +12,9 @@ from torch.testing import assert_close
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
 from torch_qpmpc import QuadraticProgram
 from torch_qpmpc.qp.kernels import sample_torch
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.device import on_device
+from torch_qpmpc.qp.program import TOLERANCE
 
 BATCH, SPOILT = 5, 2
 N_Z, N_C, N_F = 12, 3, 2

@@ -12,9 +12,9 @@ from torch.testing import assert_close
 from tests.campaign.families import in_units
 from tests.problems import KnownQP, known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
-from torch_qpmpc.qp.pipeline.arrays import TOLERANCE
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import FEW
+from torch_qpmpc.qp.program import TOLERANCE
 from torch_qpmpc.qp.solution import QPSolution
 
 BATCH = 4

@@ -52,7 +52,9 @@ from torch_qpmpc.qp.kernels.linalg import (
     summing,
     transposed_products,
 )
+from torch_qpmpc.qp.program import TOLERANCE, Status
 
+SOLVED, NOT_CONVERGED = int(Status.SOLVED), int(Status.NOT_CONVERGED)
 #: A row without free variables that is violated by more, or whose violation costs more than the
 #: second, has its weight as multiplier.
 VIOLATED, COSTLY = 1e-9, 1e-7
@@ -105,7 +107,7 @@ def offsets(fixed, group, matrix, constant):
 
 
 @compiled
-def recover(v, lam_v, group, fixed, theta, reduced, sizes, passes):
+def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
@@ -113,12 +115,12 @@ def recover(v, lam_v, group, fixed, theta, reduced, sizes, passes):
 
     Args:
         v, lam_v: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
+        iterations: returned as they are, ``(B,)``.
         group, fixed, theta, reduced, sizes: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
         passes: the number of iterative refinements of z and chi after the elimination.
 
     Returns:
-        value, z, chi, lam, xi, the codes of the active set, and the certificate's residual and
-        error of the value.
+        The parts of `BatchSolution`, SOLVED or NOT_CONVERGED.
     """
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
@@ -153,7 +155,11 @@ def recover(v, lam_v, group, fixed, theta, reduced, sizes, passes):
         add(left[i, :n_f], 1.0, xi[i])
     terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
     value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
-    return value, z, chi, lam, xi, codes, residual, error
+    status = np.full(n_qps, NOT_CONVERGED)
+    for i in range(n_qps):
+        if residual[i] <= TOLERANCE and error[i] <= TOLERANCE:
+            status[i] = SOLVED
+    return value, z, chi, lam, xi, status, residual, error, iterations, codes
 
 
 @compiled
@@ -485,11 +491,12 @@ def _short(Cz, b, C, z):
     """Return the largest error of C z = b, relative to the terms of its row."""
     error = 0.0
     for j in range(len(b)):
-        short = abs(Cz[j] - b[j])
-        relative = short / (1.0 + abs(b[j]))
-        if relative > CLOSE:
-            relative = short / (1.0 + abs(b[j]) + _weighted(z, C[j]))
-        error = max(error, relative)
+        error = max(error, abs(Cz[j] - b[j]) / (1.0 + abs(b[j])))
+    if error > CLOSE:
+        error = 0.0
+        for j in range(len(b)):
+            terms = 1.0 + abs(b[j]) + _weighted(z, C[j])
+            error = max(error, abs(Cz[j] - b[j]) / terms)
     return error
 
 
@@ -499,20 +506,23 @@ def _excess(y, lam, lb, ub, w, G, z):
 
     A violation is relative to the terms of its row, a multiplier to w.
     """
-    error = 0.0
+    error = violation = 0.0
     for j in range(len(y)):
         at, force, weight = y[j], lam[j], w[j]
         above, below = ub[j], lb[j]
-        if weight == np.inf:
-            over = max(at - above, below - at)
-            excess = over / (1.0 + abs(at))
-            if excess > CLOSE:
-                excess = over / (1.0 + _weighted(z, G[j]))
-        else:
-            excess = (abs(force) - weight) / (1.0 + weight)
+        hard = weight == np.inf
+        over = max(at - above, below - at) / (1.0 + abs(at))
+        excess = (abs(force) - weight) / (1.0 + weight)
         astray = max(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
-        error = max(error, max(excess, astray))
-    return error
+        error = max(error, max(0.0 if hard else excess, astray))
+        violation = max(violation, over if hard else 0.0)
+    if violation > CLOSE:
+        violation = 0.0
+        for j in range(len(y)):
+            if w[j] == np.inf:
+                over = max(y[j] - ub[j], lb[j] - y[j])
+                violation = max(violation, over / (1.0 + _weighted(z, G[j])))
+    return max(error, violation)
 
 
 @compiled
@@ -520,7 +530,7 @@ def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
     """Solve QPs from active sets ``(B, n_g)``, corrected where needed; complete and certify them.
 
     Returns:
-        What `recover` does, and the numbers of sets; the residual is infinite where none settled.
+        What `recover` does; NOT_CONVERGED where no set settled.
     """
     d, r, w = reduced.H.shape[1], len(reduced.rows), reduced.w
     g_l_u = offsets(fixed, group, reduced.matrix, reduced.constant)
@@ -532,9 +542,11 @@ def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
     to_g, to_lam = sensitivities.to_g, sensitivities.to_lam
     v, lam, steps, done = _try_active_sets(to_g, to_lam, group, g, lower, upper, w, codes)
     passes = np.int64(0)  # Python's type: a literal 0 would be compiled once more
-    parts = recover(v, lam, group, fixed, theta, reduced, sizes, passes)
-    parts[6][~done] = np.inf
-    return parts, steps
+    parts = recover(v, lam, steps, group, fixed, theta, reduced, sizes, passes)
+    for i in range(len(done)):
+        if not done[i]:
+            parts[5][i], parts[6][i] = NOT_CONVERGED, np.inf
+    return parts
 
 
 @compiled

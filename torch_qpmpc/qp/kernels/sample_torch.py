@@ -17,16 +17,19 @@ from torch_qpmpc.qp.kernels.sample import (
     DOUBTFUL,
     FLOOR,
     NEARLY_ACTIVE,
+    NOT_CONVERGED,
     RANGE,
     ROUNDING,
     SHARE,
+    SOLVED,
     VIOLATED,
     Terms,
 )
+from torch_qpmpc.qp.program import TOLERANCE
 from torch_qpmpc.qp.solution import active_codes
 
 
-def recover(v, lam, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
+def recover(v, lam, iterations, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
     Y_neg, C = reduced.Y_neg, theta.C
     z = multiply(reduced.T, group, torch.cat((fixed, v), dim=-1)) + reduced.z_0
     Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
@@ -44,8 +47,10 @@ def recover(v, lam, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
     left[:, : fixed.shape[-1]] += xi
     terms = Terms(Hz, G_lam, C_chi, left, y, multiply(C, group, z))
     value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced, sizes, terms)
+    solved = (errors[0] <= TOLERANCE) & (errors[1] <= TOLERANCE)
+    status = torch.where(solved, SOLVED, NOT_CONVERGED)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
-    return value, z, chi, all_lam, xi, codes, *errors
+    return value, z, chi, all_lam, xi, status, *errors, iterations, codes
 
 
 def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:

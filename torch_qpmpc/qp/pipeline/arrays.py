@@ -14,8 +14,6 @@ from torch import Tensor
 
 from torch_qpmpc.qp.program import INFINITE, Status, crossed
 
-#: The certificate rejects a solution with a larger relative residual or error of its value.
-TOLERANCE = 1e-6
 #: Hard rows that contradict each other by a larger fraction of their terms are infeasible.
 CONTRADICTED = 1e-7
 #: Optima that are further from zero have a length of their own.

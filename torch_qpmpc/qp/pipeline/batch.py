@@ -20,7 +20,6 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.pipeline.arrays import (
-    TOLERANCE,
     BackendSolution,
     BatchSolution,
     SoftQPs,
@@ -42,7 +41,7 @@ from torch_qpmpc.qp.pipeline.condensing import (
     sizes,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
-from torch_qpmpc.qp.program import NDIMS, UNKNOWN, Status, broadcast
+from torch_qpmpc.qp.program import NDIMS, UNKNOWN, broadcast
 
 T = TypeVar("T")
 #: The positions of H, C and G.
@@ -329,7 +328,7 @@ class Programs:
         The residual is infinite where a set does not.
         """
         sensitivities = self.prepared.sensitivities(self.n_f)
-        return certified(*sample.recall(active, sensitivities, *self._data()))
+        return BatchSolution(*sample.recall(active, sensitivities, *self._data()))
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -337,8 +336,7 @@ class Programs:
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
         elimination.
         """
-        parts = sample.recover(candidate.v, candidate.lam, *self._data(), passes)
-        return certified(parts, candidate.iterations)
+        return BatchSolution(*sample.recover(*candidate, *self._data(), passes))
 
     def certify(
         self, z: np.ndarray, lam: np.ndarray, chi: np.ndarray, xi: np.ndarray
@@ -357,14 +355,6 @@ class Programs:
     def _data(self) -> tuple:
         prepared, n_f = self.prepared, self.n_f
         return self.group, self.fixed, self.theta, prepared.reduced(n_f), prepared.sizes(n_f)
-
-
-def certified(parts: Sequence[np.ndarray], iterations: np.ndarray) -> BatchSolution:
-    """Return the candidates of a kernel's parts; those with errors up to `TOLERANCE` are solved."""
-    value, z, chi, lam, xi, active, residual, error = parts
-    solved = (residual <= TOLERANCE) & (error <= TOLERANCE)
-    status = np.where(solved, int(Status.SOLVED), int(Status.NOT_CONVERGED))
-    return BatchSolution(value, z, chi, lam, xi, status, residual, error, iterations, active)
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs, Theta, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Programs, certified
+from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced, Sizes
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import interior_point
@@ -31,9 +31,9 @@ def attempt(programs: Programs, device: torch.device) -> BatchSolution:
     theta, reduced, sizes = on_device(programs, device)
     group, fixed = (torch.from_numpy(x).to(device) for x in (programs.group, programs.fixed))
     qps = reduced_qps(reduced, group, fixed)
-    v, lam, iterations = interior_point.solve(qps)
-    parts = sample_torch.recover(v, lam, group, fixed, theta, reduced, sizes)
-    return certified([to_numpy(x) for x in parts], to_numpy(iterations))
+    found = interior_point.solve(qps)
+    parts = sample_torch.recover(*found, group, fixed, theta, reduced, sizes)
+    return BatchSolution._make(map(to_numpy, parts))
 
 
 def on_device(programs: Programs, device: torch.device) -> tuple[Theta, Reduced, Sizes]:

@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
-from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, TOLERANCE
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
-from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.program import TOLERANCE, Status
 
 #: A sum counts as zero, or as significant, relative to the sum of its absolute terms.
 ROUNDING, SIGNIFICANT = 1e-12, 1e-7

@@ -18,9 +18,9 @@ import torch
 
 from torch_qpmpc.qp.kernels.linalg import compiled
 from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
-from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, TOLERANCE, BatchSolution
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.program import Status
+from torch_qpmpc.qp.program import TOLERANCE, Status
 
 #: Largest number of active sets from one start: what is solved at all takes one or two.
 MAX_SETS = 6
