@@ -90,6 +90,20 @@ def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost(tmp_path)
     assert steps.violation.max() == 0
 
 
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
+def test_a_row_of_p_alone_is_judged_by_its_own_terms(length, tmp_path):
+    """As the QP layer judges it: see tests/qp/pipeline/test_certificate.py."""
+    G = np.array([[length, 0.0]])
+    bounds = {"constraints": (G, [-torch.inf], [0.5 * length]), "constraint_slack": torch.inf}
+    mpc = QPMPC.from_model(
+        [[0.1]], [[1.0]], 1, stage_weight=[1.0, 1.0], on_failure="mask", **bounds
+    )
+    p = 0.5 * (1 + np.array([[3e-8], [3e-5]]))
+    library, _ = load(mpc, tmp_path)
+    assert [*library.steps(library.states(2), p, 1).codes] == [SOLVED, INFEASIBLE]
+    assert mpc.solve(torch.as_tensor(p)).solved.tolist() == [True, False]
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
 def test_an_invalid_p_holds_the_last_action(bad, tmp_path):
     mpc = rates()

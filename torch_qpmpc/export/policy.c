@@ -428,15 +428,20 @@ static int prepare(policy_state *s, const real p[], real *v_free)
 /* Judge the rows that p alone determines; return 0 if a hard one is violated. */
 static int judge(const real p[], policy_info *info)
 {
-    int i, holds = 1;
+    int i, j, holds = 1;
     for (i = 0; i < POLICY_KNOWN; i++) {
-        real y = dot(KNOWN_P[i], p, POLICY_N_P);
-        real off = distance(y, KNOWN_LOWER[i], KNOWN_UPPER[i]);
+        real y = 0, size = KNOWN_SIZE[i], off;
+        for (j = 0; j < POLICY_N_P; j++) {
+            real term = KNOWN_P[i][j] * p[j];
+            y += term;
+            size += absolute(term);
+        }
+        off = distance(y, KNOWN_LOWER[i], KNOWN_UPPER[i]);
         if (KNOWN_W[i] < BIG) {
             info->value += KNOWN_W[i] * off;
         } else {
             info->violation = larger(info->violation, off);
-            if (off > KNOWN_FEASIBLE * (1 + absolute(y))) holds = 0;
+            if (off > KNOWN_FEASIBLE * size) holds = 0;
         }
     }
     return holds;

@@ -41,7 +41,8 @@ class Rows:
     Attributes:
         Y: ``(r, n_p)``, y without multipliers is ``Y p``.
         lower, upper, w: ``(r,)``, infinite where there is no bound or the row is hard.
-        size: ``(r,)``, the size of the terms of y that do not depend on p or multipliers.
+        size: ``(r,)``, the size of the terms of y that do not depend on p or multipliers; at least
+            the certificate's floor in rows of p alone.
         unit: ``(r,)``, y in the units of G's row is ``unit`` times that of the table.
     """
 
@@ -157,7 +158,10 @@ def make_tables(mpc: QPMPC) -> Tables:
     bounds = lb, ub, w
     rows = _rows(G[on_plan] @ Z, G[on_plan] @ z_0, unit, *(x[on_plan] for x in bounds))
     others = np.flatnonzero(bounded & ~enters)
-    known = _rows(G[others] @ T_p, G[others] @ z_b, 1.0, *(x[others] for x in bounds))
+    # The certificate's floor: |G_i|, or the smaller nonzero bound.
+    near = np.minimum(*(np.where(x != 0, np.abs(x), np.inf) for x in (lb, ub)))
+    parts = G @ T_p, G @ z_b, np.ones(len(G)), *bounds, np.minimum(np.abs(G).sum(-1), near)
+    known = _rows(*(x[others] for x in parts))
     pairs = zip(known.parts(), _implied(C, T_p, z_b, b).parts(), strict=True)
     known = Rows(*map(np.concatenate, pairs))
     u = slice(n_p, n_p + n_u)
@@ -214,10 +218,11 @@ def _solve(factor: Array, right: Array) -> Array:
     return np.linalg.solve(factor.T, np.linalg.solve(factor, right))
 
 
-def _rows(Y: Array, y_0: Array, unit: Array | float, lb: Array, ub: Array, w: Array) -> Rows:
-    unit = np.broadcast_to(unit, y_0.shape)
+def _rows(
+    Y: Array, y_0: Array, unit: Array, lb: Array, ub: Array, w: Array, least: Array | float = 0.0
+) -> Rows:
     upper = np.maximum(lb, ub)  # bounds that cross by rounding are equal
-    below, above, size = (lb - y_0) / unit, (upper - y_0) / unit, np.abs(y_0) / unit
+    below, above, size = (lb - y_0) / unit, (upper - y_0) / unit, (least + np.abs(y_0)) / unit
     return Rows(Y / unit[:, None], below, above, w * unit, size, unit)
 
 
@@ -230,7 +235,7 @@ def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
     size = np.abs(C).sum(-1) * (np.abs(T_p).sum(-1) + np.abs(z_b)).max() + np.abs(b)
     remain = np.maximum(np.abs(Y).max(-1, initial=0), np.abs(y_0 - b)) > 1e-9 * size
     b, hard = b[remain], np.full(remain.sum(), np.inf)
-    return _rows(Y[remain], y_0[remain], 1.0, b, b, hard)
+    return _rows(Y[remain], y_0[remain], np.ones(len(b)), b, b, hard, size[remain])
 
 
 def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[Array, Array]:

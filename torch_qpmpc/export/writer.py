@@ -193,6 +193,7 @@ def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
         "KNOWN_LOWER": known.lower,
         "KNOWN_UPPER": known.upper,
         "KNOWN_W": known.w,
+        "KNOWN_SIZE": known.size,
         "U_P": tables.K,
         "U_OFFSET": tables.k,
         "U_LAMBDA": tables.F,

@@ -4,17 +4,21 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
-from torch_qpmpc import QuadraticProgram
+from torch_qpmpc import QuadraticProgram, Status
 from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.device import on_device
+from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import TOLERANCE
+from torch_qpmpc.qp.solvers.interior_point import BatchedQPs
 
 BATCH, SPOILT = 5, 2
 N_Z, N_C, N_F = 12, 3, 2
@@ -351,5 +355,21 @@ def test_the_certificates_judge_a_row_alike(low, length, off, right):
     residual = programs.certify(*(x.numpy() for x in claim))[1]
     rest = (torch.from_numpy(x) for x in (programs.group, programs.fixed))
     of_torch = sample_torch.certify(*claim, *rest, *on_device(programs, torch.device("cpu")))[1]
-    assert (residual[0] <= TOLERANCE) == right
-    assert (of_torch[0] <= TOLERANCE) == right
+    method = BatchedQPs.of(SoftQPs._make(map(to_tensor, programs.reduced_qps())))
+    for found in (residual, of_torch, method.residual(z, lam)):
+        assert (found[0] <= TOLERANCE) == right
+
+
+@pytest.mark.parametrize(("off", "right"), VIOLATIONS)
+@pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
+def test_a_refinement_judges_opposed_rows_alike(length, off, right):
+    """Of z_1 <= 0.5 and z_1 >= 0.5 (1 + off), a solution is between the two."""
+    one, none, inf = torch.eye(1).double(), torch.zeros(0).double(), torch.full((2,), torch.inf)
+    G, middle = length * torch.ones(2, 1).double(), 0.5 * length
+    lb, ub = vector(-torch.inf, middle * (1 + off)), vector(middle, torch.inf)
+    data = (one, vector(-1.0), one[0, 0], one[:0], none, G, lb, ub, inf, none)
+    programs = Programs.of(*data)[0]
+    z, lam = np.full((1, 1), 0.5), np.array([[1.0, -0.5]])
+    near = programs.unsolved(Status.NOT_CONVERGED)._replace(z=z, lam=lam)
+    refine(programs, near, np.arange(1))
+    assert (near.status[0] == Status.SOLVED) == right
