@@ -41,8 +41,7 @@ class Rows:
     Attributes:
         Y: ``(r, n_p)``, y without multipliers is ``Y p``.
         lower, upper, w: ``(r,)``, infinite where there is no bound or the row is hard.
-        size: ``(r,)``, the size of the terms of y that do not depend on p or multipliers; at least
-            the certificate's floor in rows of p alone.
+        size: ``(r,)``, the terms of y without p and multipliers; in rows of p alone with a floor.
         unit: ``(r,)``, y in the units of G's row is ``unit`` times that of the table.
     """
 
@@ -145,7 +144,8 @@ def make_tables(mpc: QPMPC) -> Tables:
 
     # The minimiser without inequalities, z = Z p + z_0.
     right = np.column_stack((H @ T_p, H @ z_b + q))
-    free = np.column_stack((T_p, z_b)) - T_v @ _solve(factor, T_v.T @ right)
+    v = np.linalg.solve(factor.T, np.linalg.solve(factor, T_v.T @ right))
+    free = np.column_stack((T_p, z_b)) - T_v @ v
     Z, z_0 = free[:, :n_p], free[:, n_p]
 
     G_v = G @ T_v
@@ -161,9 +161,8 @@ def make_tables(mpc: QPMPC) -> Tables:
     # The certificate's floor: |G_i|, or the smaller nonzero bound.
     near = np.minimum(*(np.where(x != 0, np.abs(x), np.inf) for x in (lb, ub)))
     parts = G @ T_p, G @ z_b, np.ones(len(G)), *bounds, np.minimum(np.abs(G).sum(-1), near)
-    known = _rows(*(x[others] for x in parts))
-    pairs = zip(known.parts(), _implied(C, T_p, z_b, b).parts(), strict=True)
-    known = Rows(*map(np.concatenate, pairs))
+    pairs = zip((x[others] for x in parts), _implied(C, T_p, z_b, b), strict=True)
+    known = _rows(*map(np.concatenate, pairs))
     u = slice(n_p, n_p + n_u)
     u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
     of_u, own = units[u], H.diagonal()[:n_p]
@@ -214,10 +213,6 @@ def _factor(H_v: Array) -> tuple[Array, float]:
     return np.linalg.cholesky(H_v), float(highest / lowest)
 
 
-def _solve(factor: Array, right: Array) -> Array:
-    return np.linalg.solve(factor.T, np.linalg.solve(factor, right))
-
-
 def _rows(
     Y: Array, y_0: Array, unit: Array, lb: Array, ub: Array, w: Array, least: Array | float = 0.0
 ) -> Rows:
@@ -226,8 +221,8 @@ def _rows(
     return Rows(Y / unit[:, None], below, above, w * unit, size, unit)
 
 
-def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
-    """Return the equations of p that remain of C z = b if its rows are dependent on the plan.
+def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> tuple[Array, ...]:
+    """Return the `_rows` of p that remain of C z = b if it has dependent rows on the plan.
 
     The rounding of T_p and z_b is a fraction of their largest entries, and not of a row's.
     """
@@ -235,7 +230,7 @@ def _implied(C: Array, T_p: Array, z_b: Array, b: Array) -> Rows:
     size = np.abs(C).sum(-1) * (np.abs(T_p).sum(-1) + np.abs(z_b)).max() + np.abs(b)
     remain = np.maximum(np.abs(Y).max(-1, initial=0), np.abs(y_0 - b)) > 1e-9 * size
     b, hard = b[remain], np.full(remain.sum(), np.inf)
-    return _rows(Y[remain], y_0[remain], np.ones(len(b)), b, b, hard, size[remain])
+    return Y[remain], y_0[remain], np.ones(len(b)), b, b, hard, size[remain]
 
 
 def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[Array, Array]:

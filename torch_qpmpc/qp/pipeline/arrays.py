@@ -148,11 +148,6 @@ class BatchSolution(NamedTuple):
         better = np.flatnonzero(better)
         self.put(index[better], others.at(better))
 
-    def clear(self, index: np.ndarray, placeholders: BatchSolution) -> None:
-        """Replace all but the errors of the solutions at ``index``."""
-        errors = {"residual": self.residual, "value_error": self.value_error}
-        self.put(index, placeholders._replace(**errors).at(index))
-
 
 def to_numpy(x: Array) -> np.ndarray:
     """Return ``x`` as an array on the CPU, without a copy if it is there already."""

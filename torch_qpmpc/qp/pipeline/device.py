@@ -24,7 +24,7 @@ def accelerator(x: Tensor) -> torch.device | None:
     return x.device if x.is_cuda else None
 
 
-def attempt(programs: Programs, device: torch.device) -> BatchSolution:
+def attempt(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
     """Return candidates of the interior-point method on ``device``, completed and certified."""
     if not len(programs) or not len(programs.prepared.reduced(programs.n_f).rows):
         return programs.unsolved(Status.NOT_CONVERGED)

@@ -265,8 +265,10 @@ def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> 
         todo = todo[solution.status[todo] == Status.NOT_CONVERGED]
     if solution is None:
         return programs.unsolved(Status.NOT_CONVERGED)
-    if solution.status.any():
-        solution.clear(np.flatnonzero(solution.status), programs.unsolved(solution.status))
+    if len(unsolved := np.flatnonzero(solution.status)):
+        errors = {"residual": solution.residual, "value_error": solution.value_error}
+        blank = programs.unsolved(solution.status)._replace(**errors)
+        solution.put(unsolved, blank.at(unsolved))
     return solution
 
 
@@ -281,7 +283,7 @@ def steps_of(
     first, *others, last = map(backed, (backend(solver), *fallbacks(solver)))
     refined = partial(_refined, log)
     return [
-        *([partial(_tried, device)] if device else []),
+        *([partial(attempt, device)] if device else []),
         *([partial(_recalled, log)] if warm else []),
         first,
         partial(_if_few, refined),
@@ -301,18 +303,12 @@ def backed(solve: Backend, passes: int = 0) -> Step:
     def step(programs: Programs, _: Any) -> BatchSolution:
         qps = programs.reduced_qps()
         run = solve if qps.l.shape[-1] else _unconstrained
-        steepest, flattest = (
-            np.abs(qps.g).max(initial=0.0),
-            np.abs(qps.H).max((1, 2), initial=0.0).min(),
-        )
+        steepest = np.abs(qps.g).max(initial=0.0)
+        flattest = np.abs(qps.H).max((1, 2), initial=0.0).min()
         answer = run(qps) if steepest <= LONG * flattest else qps.in_own_units(run)
         return programs.recover(answer, passes)
 
     return step
-
-
-def _tried(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
-    return attempt(programs, device)
 
 
 def _recalled(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
