@@ -142,6 +142,7 @@ def test_metadata_are_detached_scalars():
         torch.testing.assert_close(out[key], value, atol=1e-9, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:torch._dynamo.config.inline_inbuilt:FutureWarning")
 def test_compiled_without_graph_breaks():
     loss = make_loss(reduction="none")

@@ -118,7 +118,6 @@ def test_no_change_of_theta_leaves_an_old_answer(change):
 
 def test_large_parts_that_are_not_learned_are_compared_by_version():
     mpc = drawn_mpc(4, 2, 25, stage_weight=[1.0] * 6, state_bounds=([-1.0] * 4, [1.0] * 4), seed=2)
-    mpc.load_state_dict(mpc.state_dict())
     assert mpc.G.numel() > 2**14
     s = random_states(8, 4, size=2.0)
     assert_predicted(mpc, s)
@@ -175,7 +174,6 @@ def test_the_action_has_the_batch_and_the_dtype_of_the_state(batch, dtype):
 
 def test_a_state_without_a_solution_has_the_errors_of_a_batch():
     mpc = drawn_mpc(1, 1, 3, state_bounds=([-1.0], [1.0]), state_slack=torch.inf, solver="daqp")
-    mpc.load_state_dict(mpc.state_dict())
     assert_predicted(mpc, torch.full((1, 1), 0.1, dtype=torch.float64))
     for _ in range(2):
         with pytest.raises(SolverError, match=r"1 of 1 QPs .* 1 INFEASIBLE"):

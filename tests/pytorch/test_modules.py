@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 
 import pytest
@@ -165,15 +164,6 @@ def test_strided_expanded_and_empty_inputs():
 
 
 # Copies
-
-
-@kinds
-def test_a_whole_module_is_saved_and_loaded(kind):
-    mpc, file = random_mpc(0, **KINDS[kind]), io.BytesIO()
-    torch.save(mpc, file)
-    file.seek(0)
-    s = known(mpc)
-    assert_close(torch.load(file, weights_only=False).value(s), mpc.value(s), rtol=0, atol=0)
 
 
 def test_a_shallow_copy_shares_the_parameters():

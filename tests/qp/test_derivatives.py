@@ -204,16 +204,6 @@ def test_an_unsolved_element_has_no_gradient_whatever_comes_in():
     assert all(p.grad.isfinite().all() for p in mpc.parameters() if p.grad is not None)
 
 
-def test_compiled_policy_and_its_gradient():
-    mpc, s = random_mpc(0), random_states(4)
-    compiled = torch.compile(mpc.policy, fullgraph=True, backend="aot_eager")
-    gradients = []
-    for policy in (mpc.policy, compiled):
-        leaf = s.clone().requires_grad_()
-        gradients.append(torch.autograd.grad(policy(leaf).square().sum(), leaf)[0])
-    assert_close(*gradients)
-
-
 @pytest.mark.parametrize("length", [1e-8, 1.0, 1e8])
 @pytest.mark.parametrize("cost", [1e-12, 1e-8, 1.0, 1e8])
 def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
