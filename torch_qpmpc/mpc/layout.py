@@ -244,6 +244,8 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int, E: Tensor | None = None) -
     n, n_z = n_x + n_u, horizon * (n_x + n_u) + n_x
     padded = F.pad(band.movedim(1, 0), (0, n_z + n - band.shape[-1])).flatten(1)
     C = padded[:, : horizon * n_z].unflatten(-1, (horizon, n_z)).movedim(0, 1).flatten(0, 1)
+    if not n_d:
+        return C
     preview = F.pad(torch.block_diag(*E.expand(horizon, n_x, n_d)), (0, n_d))
     return torch.cat((preview, C), dim=-1)
 
