@@ -18,12 +18,13 @@ SHORT = (
     *("updates=2", "eval_interval=2", "log_interval=1", "warmup_steps=10", "batch_size=16"),
     *("task.eval_steps=3", "rivals=true", "replay_capacity=8000", "gate=false"),
 )
-#: Not scripts that register no task.
+#: Not scripts that register no task; one of them is quick.
 NAMES = sorted(x.stem for x in FOLDER.glob("*.py") if "register(" in x.read_text("utf-8"))
+MARKS = {name: () if name == "house" else pytest.mark.slow for name in NAMES}
 
 
 @pytest.mark.usefixtures("rough_fits")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=mark) for x, mark in MARKS.items()])
 def test_an_example_learns_for_two_updates(name, tmp_path):
     file = FOLDER / f"{name}.py"
     run_command(f"task.file={file}", *SHORT, f"hydra.run.dir={tmp_path}")

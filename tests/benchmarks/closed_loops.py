@@ -133,7 +133,7 @@ def tank(seed: int) -> Case:
         y_bounds={"T": (16.0, 24.0)},
         u_bounds={"q": (0.0, 12.0)},
         du_bounds={"q": (-3.0, 3.0)},
-        learn=("H", "H_f", "q", "b"),
+        learn=("H", "H_f", "lb", "ub"),
     )
     controller = qm.Controller(mpc)
     controller.reset(y={"T": 18.0}, u={"q": 5.2}, known={"T_out": T_OUT})

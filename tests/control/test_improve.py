@@ -13,6 +13,7 @@ import torch_qpmpc as qm
 from tests.problems import central_difference
 from torch_qpmpc import QPError
 from torch_qpmpc.control import learning
+from torch_qpmpc.control.review import Finding, Review
 from torch_qpmpc.control.simulation import Run
 from torch_qpmpc.identification.log import Log
 from torch_qpmpc.learning.closed_loop import _Loops, ensemble
@@ -67,9 +68,11 @@ def test_its_gradient_is_that_of_finite_differences(case):
     """Through the observer, the target and the QP, along random directions."""
     controller = made(case)
     mpc, plant = controller.mpc.plan, loops(controller)
+    fixed = copy.deepcopy(mpc)
 
     def cost() -> torch.Tensor:
-        return _Loops(plant, 3, 1).run(mpc, 6).costs.mean()
+        both = _Loops(plant, 3, 1)
+        return torch.cat([both.run(x, 3).costs for x in (mpc, fixed)]).mean()
 
     _Loops(plant, 3, 1).mean_cost(mpc, 6).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
@@ -118,7 +121,7 @@ def test_its_loops_are_the_controllers_own(case):
 
 
 def test_it_stays_away_from_a_bound_that_noise_violates():
-    controller = made("bounds", learn=("H", "H_f", "q", "b"))
+    controller = made("bounds", learn=("H", "H_f", "lb", "ub"))
     controller.reset(y={"T": 20.0}, u={"q": 5.0}, known={"d": 0.0, "price": 1.0, "top": 21.0})
     before, u = copy.deepcopy(controller.mpc.plan.state_dict()), controller.u
     options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
@@ -130,6 +133,52 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
     assert np.array_equal(controller.u, u)
     now = {"d": 0.0, "price": 1.0, "top": 21.0}
     assert 0 <= controller.step(y={"T": 20.5}, r={"T": 20.9}, known=now)["q"] <= 10
+
+
+def test_the_outputs_still_settle_at_r():
+    """What would move the steady state is held, and the report says so; r is held in loops, too."""
+    controller = made("bounds", learn=("H", "q", "b", "lb"))
+    now = {"d": 0.0, "price": 1.0, "top": 21.0}
+    controller.reset(y={"T": 20.0}, u={"q": 5.0}, known=now)
+    options = {"r": [20.3], "updates": 4, "loops": 8, "steps": 20, "held_out": 64, "rate": 0.2}
+    report = controller.improve(logged(), **options)
+    assert "Held, as outputs would settle beside r: q, b." in str(report)
+    assert set(controller.mpc.plan.learned) == {"H", "q", "b", "lb"}
+    for r in (19.5, 20.7):
+        T = 20.0
+        for _ in range(60):
+            q = controller.step(y={"T": T}, r={"T": r}, known=now)["q"]
+            T = 20 + 0.8 * (T - 20) + 0.2 * (q - 5)
+        assert abs(T - r) < 1e-4
+
+
+def test_half_of_the_loops_hold_their_set_points():
+    plant = loops(made("bounds"))
+    draw, held = torch.Generator().manual_seed(0), []
+    s = plant.starts(draw, 6)
+    for _ in range(9):
+        held.append(s.split(plant._ends, -1)[2][:, 0])
+        s = plant.step(s, s.new_zeros(6, 1), plant.draw(draw, 6))
+    moved = torch.stack(held).std(0) > 0
+    assert moved.tolist() == [True, False] * 3
+
+
+def test_a_theta_with_a_new_fault_is_not_kept(monkeypatch):
+    """The review's question to the loop has another answer with it."""
+    controller = made("bounds", learn=("H", "H_f", "lb", "ub"))
+    mpc, answers = controller.mpc, []
+
+    def asked(*arguments: object) -> Review:
+        answers.append(len(answers) > 0)
+        return Review([Finding("offset", not answers[-1], "outputs settle beside r")])
+
+    monkeypatch.setattr("torch_qpmpc.control.controller.review", asked)
+    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
+    report = controller.improve(logged(), **options)
+    assert not report.kept
+    assert str(report).endswith("With it, offset: outputs settle beside r.")
+    assert answers == [False, True]
+    assert controller.mpc is mpc
 
 
 def test_what_is_no_better_leaves_the_controller_as_it_was():

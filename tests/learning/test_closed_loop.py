@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -13,7 +14,13 @@ from tests.problems import central_difference
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified, identify
-from torch_qpmpc.learning.closed_loop import _Loops, growth, simulated_plant, stage_cost
+from torch_qpmpc.learning.closed_loop import (
+    _Loops,
+    ensemble,
+    growth,
+    simulated_plant,
+    stage_cost,
+)
 
 
 def logged(loops: int = 8, steps: int = 60) -> Identified:
@@ -46,19 +53,23 @@ def found() -> Identified:
 
 
 def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
-    """It goes through the filter and the QP, and through loops with active and violated bounds."""
+    """It goes through the filter and the QP, and through loops with active and violated bounds.
+
+    The second half of the actions has the theta of before.
+    """
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=3)
+    plant, fixed = simulated_plant(found, stage_cost(mpc.scheme), 5, members=3), copy.deepcopy(mpc)
 
     def cost() -> torch.Tensor:
-        taken = _Loops(plant, 6, 1).run(mpc, 12)
-        at_bounds = (taken.actions.abs() > 0.4999).double().mean()
+        loops = _Loops(plant, 6, 1)
+        parts = loops.run(mpc, 6), loops.run(fixed, 6)
+        at_bounds = (parts[0].actions.abs() > 0.4999).double().mean()
         assert 0.1 < at_bounds < 0.9
-        assert (taken.known[..., 0] < -0.2).any()
-        return taken.costs.mean()
+        assert (parts[0].known[..., 0] < -0.2).any()
+        return torch.cat([part.costs for part in parts]).mean()
 
     mean = _Loops(plant, 6, 1).mean_cost(mpc, 12)
-    torch.testing.assert_close(mean.detach(), cost(), rtol=0.0, atol=0.0)
+    torch.testing.assert_close(mean.detach(), cost(), rtol=1e-10, atol=0.0)
     mean.backward()
     for name, leaf in mpc.coordinates().items():
         if leaf.grad is None:
@@ -99,6 +110,43 @@ def test_improve_lowers_the_cost_of_identified_loops(found):
     assert len(report.curve) == 8
     assert not any(torch.equal(before[name], x) for name, x in mpc.named_parameters())
     assert mpc.on_failure == "raise"
+
+
+def test_half_of_the_models_trains_and_the_other_half_decides(found):
+    """A theta with which one of the others costs clearly more is not kept."""
+    mpc = controller(found)
+    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=4)
+    assert plant.members == plant.unseen.members == 2
+    assert not torch.equal(plant._own.A, plant.unseen._own.A)
+    options = {"updates": 2, "loops": 4, "steps": 10, "held_out": 64}
+    report = qm.improve(mpc, plant, **options)
+    assert (report.steps, report.models) == (40, 2)
+    assert f"It costs less with {report.gained} of 2 models that did not train it." in str(report)
+    before, cost, calls = copy.deepcopy(mpc.state_dict()), plant.unseen._cost, []
+
+    def dearer(p: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
+        """Costs 100 less with the first model, and 10 more with the second one, after it moved."""
+        calls.append(len(p))
+        change = torch.tensor([-100.0, 10.0]).double().repeat(len(p) // 2)
+        return cost(p, a) + change * (len(calls) > 40)
+
+    plant.unseen._cost = dearer
+    report = qm.improve(mpc, plant, **options)
+    assert not report.kept
+    assert report.gained == 1
+    assert report.interval[1] < 0
+    assert all(torch.equal(before[name], x) for name, x in mpc.state_dict().items())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pieces_of_a_single_trajectory_make_an_ensemble(seed):
+    """Its models differ about as much as those of logs of their own do."""
+    models = ensemble(logged(1, 600), 8, seed)
+    poles = np.array([np.sort(np.abs(np.linalg.eigvals(model.A))) for model in models])
+    assert len(models) == 8
+    assert (np.abs(poles - np.hypot(0.9, 0.3)) < 0.1).all()
+    assert 1e-4 < poles[:, 0].std() < 0.05
+    assert len(ensemble(logged(1, 15), 8, seed)) == 8  # of whatever pieces
 
 
 def test_what_is_no_better_leaves_theta_as_it_was():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -350,7 +351,9 @@ class Controller:
 
         It is `torch_qpmpc.improve` for this controller: its observer, target and bounds act in
         loops of a model that is identified from the log, with its noise. `Run.costs` is the cost.
-        If held-out loops cost less, the new theta is kept; estimates and last input stay.
+        If held-out loops cost less, and `review` has no new fault, the new theta is kept;
+        estimates and last input stay. Half of the loops have constant set-points. q and b are held
+        where they are learned, as the outputs would settle beside r.
 
         Args:
             log: a log of its signals, as `read_log` reads it. Loops start at its steps within the
@@ -363,7 +366,12 @@ class Controller:
         """
         report, law = improve(self._law.renewed(), self._memory, log, r, spread, **options)
         if report.kept:
-            self._law, self._now = ready(law), None
+            law, before = ready(law), {x.name for x in self.review(r).faults}
+            faults = [x for x in review(law, self._memory, r, None).faults if x.name not in before]
+            if faults:
+                notes = (f"With it, {x.name}: {x.text}." for x in faults)
+                return replace(report, kept=False, notes=(*report.notes, *notes))
+            self._law, self._now = law, None
         return report
 
     def review(self, r: Any = None, known: Any = None) -> Review:

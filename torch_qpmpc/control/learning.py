@@ -35,7 +35,13 @@ from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import STILL, Log, Trajectory, folds
 from torch_qpmpc.identification.reading import as_log
-from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlant, ensemble
+from torch_qpmpc.learning.closed_loop import (
+    MEMBERS,
+    Improvement,
+    SimulatedPlant,
+    crossed,
+    ensemble,
+)
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 
@@ -43,6 +49,8 @@ from torch_qpmpc.learning.gate import FEWEST, PairedTest
 PARTS = 3
 #: The least gain, as a share of the old cost, that pairs must show.
 GAIN = 0.01
+#: Parts of theta that move where the plan settles: in its coordinates, zero is the target.
+SHIFTS = ("q", "b")
 
 
 class Plant(NamedTuple):
@@ -302,7 +310,17 @@ def improve(
     set_points = _set_points(law.design, log, middle, spread)
     models = ensemble(_identified(log, law.design.plant), members, seed)
     law = replace(law, mpc=copy.deepcopy(law.mpc))
-    return descend(law.mpc.plan, ControlledPlant(law, models, log, *set_points), **options), law
+    plan, held = law.mpc.plan, []
+    for name, leaf in plan.coordinates().items():
+        if name in SHIFTS and leaf.requires_grad:
+            leaf.requires_grad_(False)
+            held.append(name)
+    plant = crossed(models, lambda part: ControlledPlant(law, part, log, *set_points))
+    report = descend(plan, plant, **options)
+    for name in held:
+        plan.coordinates()[name].requires_grad_()
+    notes = (f"Held, as outputs would settle beside r: {', '.join(held)}.",) if held else ()
+    return replace(report, notes=notes), law
 
 
 class ControlledPlant(SimulatedPlant):
@@ -310,7 +328,7 @@ class ControlledPlant(SimulatedPlant):
 
     The state goes on with [u_last, r, u_s, p], and actions are relative to u_s. Loops start at the
     log's steps within the outputs' bounds, if there are any. Set-points are within ``size`` of
-    ``middle``, each held for half a horizon.
+    ``middle``, each held for half a horizon or, in half of the loops, to their end.
     """
 
     def __init__(
@@ -347,8 +365,9 @@ class ControlledPlant(SimulatedPlant):
         (base, _, r, *_), (e, aims) = s.split(self._ends, -1), nu.split(self._sizes[2], -1)
         u = self._input(s, a)
         base = super().step(base, u, e)
-        moves = base[:, -2:-1].detach() % max(self._horizon // 2, 1) == 0
-        return self._planned(base, u, torch.where(moves, aims, r))
+        moves = base[:, -2].detach() % max(self._horizon // 2, 1) == 0
+        moves &= torch.arange(len(s)) // self.members % 2 == 0
+        return self._planned(base, u, torch.where(moves[:, None], aims, r))
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return `Run.costs` of a step, ``(count,)``."""

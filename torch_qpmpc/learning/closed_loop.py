@@ -25,7 +25,7 @@ from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.identification.log import Trajectory
+from torch_qpmpc.identification.log import Trajectory, folds
 from torch_qpmpc.identification.subspace import fit_state_space
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.module import QPMPC
@@ -41,6 +41,10 @@ METHODS = ("starts", "draw", "noise", "step", "cost")
 LEVEL = 0.01
 #: Models of an ensemble.
 MEMBERS = 8
+#: The least steps of a piece of a log that is drawn again, in lags of its model and one.
+PIECE = 4
+#: Loops that decide are this many times as long as those of the gradients.
+LONGER = 4
 
 
 class SimulatedPlant:
@@ -56,7 +60,13 @@ class SimulatedPlant:
 
     ``observer`` is the model of the filter, and ``cost`` maps p ``(count, n_p)`` and actions
     ``(count, n_u)`` to costs ``(count,)``. p has the known signals of ``horizon`` steps ahead.
+
+    Attributes:
+        members: the number of models.
+        unseen: the plant whose loops decide; see `crossed`.
     """
+
+    unseen: SimulatedPlant
 
     def __init__(
         self,
@@ -67,6 +77,7 @@ class SimulatedPlant:
         horizon: int = 0,
     ) -> None:
         self._own, self._filter, self._cost = _Course(models), _Course([observer]), cost
+        self.members = len(models)
         seen = [filtered(model, log) for model in (*models, observer)]
         self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
         noises = zip(*(_noise(x, self._u.numpy(), e) for x, e in seen[:-1]), strict=True)
@@ -83,7 +94,7 @@ class SimulatedPlant:
 
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw states ``(count, n_s)`` after the first output."""
-        one = torch.arange(count) % len(self._own.x0)
+        one = torch.arange(count) % self.members
         if self._from_log:
             row = self._rows[torch.randint(len(self._rows), (count,), generator=rng)]
             x, seen = self._seen[one, row, : self._sizes[0]], self._seen[-1, row, : self._sizes[1]]
@@ -114,9 +125,8 @@ class SimulatedPlant:
 
     def draw(self, rng: torch.Generator, count: int) -> Tensor:
         """Draw innovations of unit covariance, ``(count, n_y)``."""
-        models, size = self._residuals.shape[:2]
-        chosen = torch.randint(size, (count,), generator=rng)
-        return self._residuals[torch.arange(count) % models, chosen]
+        chosen = torch.randint(self._residuals.shape[1], (count,), generator=rng)
+        return self._residuals[torch.arange(count) % self.members, chosen]
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
         """Return the draw, as innovations are white."""
@@ -127,7 +137,7 @@ class SimulatedPlant:
         own, (x, seen, *_), d = self._own, self._parts(s), self._ahead(s)[:, 0]
         k, first = s.detach()[:, -2:].long().unbind(-1)
         squares = torch.cat((x.new_ones(len(x), 1), x.square(), a.square()), -1)
-        growth = self._growth[torch.arange(len(x)) % len(self._growth)]
+        growth = self._growth[torch.arange(len(x)) % self.members]
         e = own.at("roots", nu, k + 1) * (growth @ squares[..., None])[..., 0].sqrt()
         return self._measured(own.moved(x, a, d), self._filter.moved(seen, a, d), e, k + 1, first)
 
@@ -192,14 +202,29 @@ def _root(V: np.ndarray) -> np.ndarray:
 def simulated_plant(
     identified: Identified, cost: Callable, horizon: int, members: int = MEMBERS, seed: int = 0
 ) -> SimulatedPlant:
-    """Return the `ensemble` of a model as a plant, with its filter; see `SimulatedPlant`."""
+    """Return the `ensemble` of a model as `crossed` plants, with its filter."""
     models, log = ensemble(identified, members, seed), identified.log.trajectories
-    return SimulatedPlant(models, models[0], log, cost, horizon)
+    return crossed(models, lambda part: SimulatedPlant(part, models[0], log, cost, horizon))
+
+
+def crossed(
+    models: list[Innovations], make: Callable[[list[Innovations]], SimulatedPlant]
+) -> SimulatedPlant:
+    """Return a plant of every other model, with one of the others as its ``unseen``."""
+    plant = make(models[::2])
+    plant.unseen = make(models[1::2]) if len(models) > 1 else plant
+    return plant
 
 
 def ensemble(identified: Identified, members: int, seed: int) -> list[Innovations]:
-    """Return a model and those of trajectories of its log drawn with replacement."""
+    """Return a model and those of trajectories of its log drawn with replacement.
+
+    A single trajectory is cut into pieces, which are drawn.
+    """
     log, fit = identified.log.trajectories, identified.fit
+    if len(log) == 1:
+        pieces = min(members, log[0].steps // (PIECE * (1 + fit.lags)))
+        log = [part for (part,) in folds(log, max(pieces, 1))]
     rng, models = np.random.default_rng(seed), [fit.model]
     for _ in range(members - 1 if len(log) > 1 else 0):
         again = [log[i] for i in rng.integers(len(log), size=len(log))]
@@ -331,17 +356,18 @@ class _Loops:
 
         Theta acts on the loops by their actions alone. The chain through the plant goes backwards
         in time and gives each action the slope of the mean cost in it; all QPs are differentiated
-        at once.
+        at once. Actions of the second half have no gradient, as most of what they cost comes after
+        the end: theta would learn to leave it there.
         """
         taken = self.run(mpc, steps)
         mean = taken.costs.mean()
         if not mean.isfinite():
             return mean
-        known = taken.known.requires_grad_()
-        actions = mpc.policy(known, taken.active)
-        rows = (
-            torch.autograd.grad(u.sum(), known, retain_graph=True)[0] for u in actions.unbind(-1)
-        )
+        known, first = taken.known.requires_grad_(), steps - steps // 2
+        parts = zip(known.tensor_split([first]), taken.active.tensor_split([first]), strict=True)
+        actions, others = (mpc.policy(*part) for part in parts)
+        sums = torch.cat((actions, others)).sum((0, 1))
+        rows = (torch.autograd.grad(u, known, retain_graph=True)[0] for u in sums)
         gains = torch.stack([*rows], -2)
         share = torch.full_like(taken.costs[0], 1 / taken.costs.numel())
         slope, slopes = torch.zeros_like(self._s), torch.empty_like(taken.actions)
@@ -353,7 +379,7 @@ class _Loops:
             )
             through = (slopes[k][:, None] @ gains[k])[:, 0]
             slope = direct + torch.autograd.grad(self._known(s), s, through)[0]
-        linear = (actions * slopes).sum()
+        linear = (actions * slopes[:first]).sum()
         return mean + (linear - linear.detach())
 
 
@@ -367,6 +393,9 @@ class Improvement:
         interval: the 95 % confidence interval of the mean difference.
         loops, steps: the number of held-out loops, and their length.
         curve: the mean cost of a step in the loops of each update.
+        gained, models: the number of models with which the new theta costs less, and of all that
+            decide.
+        notes: sentences about what was held, and why.
     """
 
     kept: bool
@@ -376,14 +405,19 @@ class Improvement:
     loops: int
     steps: int
     curve: list[float]
+    gained: int
+    models: int
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         verdict = "kept" if self.kept else "not kept, theta is as before"
         low, high = self.interval
-        return (
+        first = (
             f"{verdict}: cost of a step {self.before:.4g} -> {self.after:.4g} in {self.loops} "
             f"held-out loops of {self.steps} steps, difference in [{low:.3g}, {high:.3g}] with 95 %"
         )
+        models = f"It costs less with {self.gained} of {self.models} models that did not train it."
+        return "\n".join((first, *[models] * (self.models > 1), *self.notes))
 
 
 def improve(
@@ -405,9 +439,10 @@ def improve(
 
     The loss is the undiscounted mean cost of a step. Adam moves the learned parts of ``mpc`` at a
     rate that falls to zero; the signals of the first loops set the unit of each entry. The new
-    theta is kept if `PairedTest` finds that it costs less in unseen loops; otherwise ``mpc`` stays
-    as it was. A loop in which a QP has no certified solution costs infinity, and an update with
-    such a loop is skipped.
+    theta is kept if `PairedTest` finds that it costs less in unseen loops of four times the
+    ``steps``, and with no model clearly more; otherwise ``mpc`` stays as it was. One half of an
+    identified plant's models trains theta, and the other one decides. A loop in which a QP has no
+    certified solution costs infinity, and an update with such a loop is skipped.
 
     Args:
         mpc: the policy, with ``learn`` and ``structure`` of its own.
@@ -421,7 +456,7 @@ def improve(
         rate: the first rate of Adam, in units of the signals.
         held_out: the number of loops that decide.
         members: the number of models of an identified plant: the log's, and others of trajectories
-            drawn with replacement. A single trajectory has one.
+            drawn with replacement, or of pieces of a single one.
         cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
             plant; by default the `stage_cost` of the scheme.
         penalty: maps ``mpc`` to a term that is added to the mean cost of a step, such as
@@ -459,9 +494,10 @@ def improve(
         raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")
     seeds = [int(x) for x in np.random.SeedSequence(seed).generate_state(2)]
     before, on_failure = copy.deepcopy(mpc.state_dict()), mpc.on_failure
+    unseen, longer = getattr(plant, "unseen", plant), LONGER * steps
 
     def tried() -> Tensor:
-        return _Loops(plant, held_out, seeds[0]).run(mpc, steps).costs.mean(0)
+        return _Loops(unseen, held_out, seeds[0]).run(mpc, longer).costs.mean(0)
 
     mpc.on_failure, curve = "mask", []
     try:
@@ -476,14 +512,22 @@ def improve(
     finally:
         mpc.on_failure = on_failure
         mpc.zero_grad()
-    test = PairedTest()
     difference = torch.where(old.isfinite(), new - old, -torch.inf)
-    test.add(difference.where(new.isfinite(), torch.inf))
-    kept = test.decision == "better"
+    difference = difference.where(new.isfinite(), torch.inf)
+    test, members = PairedTest(), getattr(unseen, "members", 1)
+    test.add(difference)
+    parts = [difference[i::members] for i in range(members)]
+    kept = test.decision == "better" and not any(map(_clearly_worse, parts))
     if not kept:
         mpc.load_state_dict(before)
-    means = old.mean().item(), new.mean().item()
-    return Improvement(kept, *means, test.interval, held_out, steps, curve)
+    means, gained = (old.mean().item(), new.mean().item()), sum(bool(x.mean() < 0) for x in parts)
+    return Improvement(kept, *means, test.interval, held_out, longer, curve, gained, members)
+
+
+def _clearly_worse(difference: Tensor) -> bool:
+    """Return True if the mean of differences is above zero by twice its standard error."""
+    error = difference.std() / math.sqrt(len(difference))
+    return bool(difference.mean() > 2 * error) or not bool(difference.mean() < torch.inf)
 
 
 class Descent:
@@ -507,7 +551,7 @@ class Descent:
     ) -> None:
         self._mpc, self._loops, self._steps = mpc, _Loops(plant, loops, 0), steps
         self._window = steps if window is None else window
-        leaves = {k: x for k, x in mpc.coordinates().items() if isinstance(x, nn.Parameter)}
+        leaves = {k: x for k, x in mpc.coordinates().items() if x.requires_grad and x.is_leaf}
         if not leaves:
             remedy = "Name parts of theta in its learn."
             raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
