@@ -124,7 +124,8 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
     controller = made("bounds", learn=("H", "H_f", "lb", "ub"))
     controller.reset(y={"T": 20.0}, u={"q": 5.0}, known={"d": 0.0, "price": 1.0, "top": 21.0})
     before, u = copy.deepcopy(controller.mpc.plan.state_dict()), controller.u
-    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
+    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 15, "held_out": 64}
+    options |= {"members": 2}
     report = controller.improve(logged(), **options)
     assert report.kept
     assert report.after < 0.9 * report.before
@@ -137,13 +138,13 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
 
 def test_the_outputs_still_settle_at_r():
     """What would move the steady state is held, and the report says so; r is held in loops, too."""
-    controller = made("bounds", learn=("H", "q", "b", "lb"))
+    controller = made("bounds", learn=("H", "H_f", "q", "C", "b", "lb"))
     now = {"d": 0.0, "price": 1.0, "top": 21.0}
     controller.reset(y={"T": 20.0}, u={"q": 5.0}, known=now)
     options = {"r": [20.3], "updates": 4, "loops": 8, "steps": 20, "held_out": 64, "rate": 0.2}
     report = controller.improve(logged(), **options)
     assert "Held, as outputs would settle beside r: q, b." in str(report)
-    assert set(controller.mpc.plan.learned) == {"H", "q", "b", "lb"}
+    assert set(controller.mpc.plan.learned) == {"H", "H_f", "q", "C", "b", "lb"}
     for r in (19.5, 20.7):
         T = 20.0
         for _ in range(60):
@@ -173,7 +174,8 @@ def test_a_theta_with_a_new_fault_is_not_kept(monkeypatch):
         return Review([Finding("offset", not answers[-1], "outputs settle beside r")])
 
     monkeypatch.setattr("torch_qpmpc.control.controller.review", asked)
-    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 25, "held_out": 64}
+    options = {"r": [20.9], "spread": 0.2, "updates": 8, "loops": 8, "steps": 15, "held_out": 64}
+    options |= {"members": 2}
     report = controller.improve(logged(), **options)
     assert not report.kept
     assert str(report).endswith("With it, offset: outputs settle beside r.")
@@ -197,7 +199,7 @@ def test_what_is_no_better_leaves_the_controller_as_it_was():
         ({"updates": 0}, "updates: got 0"),
         ({"spread": 0.0}, r"spread: got \[0.0\], expected distances >= 0"),
         ({"log": {"y": np.zeros(9), "u": np.zeros(9)}}, "log: got outputs"),
-        ({"learn": ()}, "mpc: got one that learns nothing"),
+        ({"learn": (), "members": 1}, "mpc: got one that learns nothing"),
     ],
 )
 def test_improve_refuses(change, message):

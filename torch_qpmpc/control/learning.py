@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
@@ -44,13 +45,12 @@ from torch_qpmpc.learning.closed_loop import (
 )
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
+from torch_qpmpc.mpc.module import QPMPC
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
 #: The least gain, as a share of the old cost, that pairs must show.
 GAIN = 0.01
-#: Parts of theta that move where the plan settles: in its coordinates, zero is the target.
-SHIFTS = ("q", "b")
 
 
 class Plant(NamedTuple):
@@ -310,17 +310,33 @@ def improve(
     set_points = _set_points(law.design, log, middle, spread)
     models = ensemble(_identified(log, law.design.plant), members, seed)
     law = replace(law, mpc=copy.deepcopy(law.mpc))
-    plan, held = law.mpc.plan, []
-    for name, leaf in plan.coordinates().items():
-        if name in SHIFTS and leaf.requires_grad:
-            leaf.requires_grad_(False)
-            held.append(name)
+    plan = law.mpc.plan
+    masks = steady(law.design, plan)
+    leaves = {k: x for k, x in plan.coordinates().items() if k in masks and x.requires_grad}
+    hooks = [x.register_hook(masks[name].to(x).mul) for name, x in leaves.items()]
     plant = crossed(models, lambda part: ControlledPlant(law, part, log, *set_points))
     report = descend(plan, plant, **options)
-    for name in held:
-        plan.coordinates()[name].requires_grad_()
-    notes = (f"Held, as outputs would settle beside r: {', '.join(held)}.",) if held else ()
+    for hook in hooks:
+        hook.remove()
+    held = ", ".join(name for name in leaves if not masks[name].any())
+    notes = (f"Held, as outputs would settle beside r: {held}.",) if held else ()
     return replace(report, notes=notes), law
+
+
+def steady(design: Design, plan: QPMPC) -> dict[str, Tensor]:
+    """Return the masks of the coordinates of theta that may move; others may as a whole.
+
+    At rest all signals of a stage are zero but the constants at the end of its state, which place
+    the bounds. Its plan stays zero if no cost and no prediction depends on them.
+    """
+    layout, constants = plan.layout, sum(map(len, design.bounded_places)) + 1
+    fixed = torch.arange(plan.n_x) >= plan.n_x - constants
+    stage = F.pad(fixed, (plan.n_d, plan.n_u))
+    of_z = F.pad(layout.stages(fixed, fixed.new_zeros(plan.n_u)), (layout.n_preview, 0))
+    moves, none = ~fixed[:, None], torch.zeros(1, dtype=torch.bool)
+    masks = {"H": stage[:, None] == stage, "A": moves & ~fixed, "B": moves, "E": moves}
+    masks["H_f"] = masks["H"][: -plan.n_u, : -plan.n_u]
+    return masks | {"C": moves.repeat(plan.horizon, 1) & ~of_z, "q": none, "b": none}
 
 
 class ControlledPlant(SimulatedPlant):
