@@ -172,9 +172,7 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
     if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
-        remedy = (
-            "See mpc.solve(s): hard rows may contradict each other; a finite slack softens them."
-        )
+        remedy = "See mpc.solve(s): hard rows may contradict each other; a finite slack mends it."
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
     H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
     terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
@@ -239,9 +237,8 @@ def _tolerance(tables: Tables, dtype: str, p: Array, lam: Array) -> float:
     A held row of policy.c is at its bound to within ``TOLERANCE size + ROUNDING |lam|``. An error
     dy of the held rows h is, by the tables, an error ``F_h Q_hh^-1 dy`` of u_0.
     """
-    tight, rounding = (
-        float(CONSTANTS[dtype][key].rstrip("f")) for key in ("TOLERANCE", "ROUNDING")
-    )
+    own = CONSTANTS[dtype]
+    tight, rounding = (float(own[key].rstrip("f")) for key in ("TOLERANCE", "ROUNDING"))
     held = (lam != 0) & (np.abs(lam) < tables.rows.w)
     bound = np.where(lam > 0, tables.rows.upper, tables.rows.lower)
     size = tables.rows.size + np.abs(tables.rows.Y) @ np.abs(p) + np.abs(bound)

@@ -53,9 +53,8 @@ class Export:
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.from_model(
-        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
-        ... )
+        >>> own = {"stage_weight": [1, 1], "action_bounds": ([-1], [1])}
+        >>> mpc = qm.QPMPC.from_model([[1]], [[1]], 3, **own)
         >>> export = qm.export_c(mpc, tempfile.mkdtemp())
         >>> [file.name for file in export.files], export.rows
         (['policy.h', 'policy.c'], 3)
@@ -233,9 +232,7 @@ class CompiledPolicy:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.from_model(
-        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
-        ... )
+        >>> mpc = qm.QPMPC.from_model([[1]], [[1]], 3, stage_weight=[1, 1])
         >>> policy = qm.CompiledPolicy(mpc)
         >>> s = torch.tensor([[1.0], [-0.5]])
         >>> torch.allclose(policy(s), mpc.policy(s))

@@ -71,9 +71,7 @@ def export_fmu(
 
     Example:
         >>> import tempfile, torch_qpmpc as qm
-        >>> mpc = qm.QPMPC.from_model(
-        ...     [[1]], [[1]], 3, stage_weight=[1, 1], action_bounds=([-1], [1])
-        ... )
+        >>> mpc = qm.QPMPC.from_model([[1]], [[1]], 3, stage_weight=[1, 1])
         >>> export = qm.export_fmu(mpc, tempfile.mkdtemp() + "/policy.fmu")
         >>> [file.name for file in export.files]
         ['policy.fmu']

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -45,14 +45,6 @@ def test_rows_with_one_bound_take_twice_the_time_of_rows_with_two():
     solve_qp(two, s, solver="proxqp")
     fastest = np.min([(seconds(one, s), seconds(two, s)) for _ in range(3)], axis=0)
     assert fastest[0] < 6 * fastest[1]
-
-
-def test_the_start_is_in_the_middle_of_the_hard_bounds_of_an_entry():
-    G = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0]])
-    lower, upper = np.array([2.0, -np.inf, 1.0, -5.0]), np.array([6.0, 3.0, 9.0, 7.0])
-    hard = np.full(4, np.inf)
-    assert_allclose(proxqp._middle(G, lower, upper, hard), [2, 0, 5])
-    assert_allclose(proxqp._middle(G, lower, upper, np.array([np.inf, 1, 1, np.inf])), [2, 0, 0])
 
 
 @pytest.mark.usefixtures("two_threads")
