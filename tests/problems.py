@@ -12,10 +12,13 @@ from torch import Tensor
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.analysis.structure import PredictionForm, prediction_form
 from torch_qpmpc.mpc.layout import banded_matrix
+from torch_qpmpc.qp.kernels import sample, sample_torch
 from torch_qpmpc.qp.kernels.batched import multiply
+from torch_qpmpc.qp.kernels.sample import Terms
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
+from torch_qpmpc.qp.pipeline.device import on_device
 from torch_qpmpc.qp.solvers import BackendSolution
 
 #: Positions of a row at the solution: inside its bounds, at one, or (if soft) beyond one.
@@ -181,6 +184,28 @@ def known_qp(
 def programs_of(known: KnownQP) -> Programs:
     """Convert a known QP to the pipeline's input."""
     return Programs.of(*known.qp.tensors(), known.fixed)[0]
+
+
+def in_torch(p: Programs) -> tuple[Any, ...]:
+    """Return the arguments of the kernels' torch forms after the candidate, on the CPU."""
+    group, fixed = torch.from_numpy(p.group), torch.from_numpy(p.fixed)
+    return group, fixed, *on_device(p.prepared, torch.device("cpu"), p.n_f)
+
+
+def certified(p: Programs, *claim: Tensor, compiled: bool = True) -> tuple[Tensor, ...]:
+    """Return value, residual and error of a value of the ``claim`` z, lam, chi, xi."""
+    z, lam, chi, xi = claim
+    group, _, theta, *_ = in_torch(p)
+    Hz, y, Cz = (multiply(x, group, z) for x in (theta.H, theta.G, theta.C))
+    G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
+    left = Hz + theta.q + G_lam + C_chi
+    left[:, : xi.shape[-1]] += xi
+    terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
+    if not compiled:
+        return sample_torch.judge(z, lam, chi, *in_torch(p), terms)
+    arrays = Terms._make(x.contiguous().numpy() for x in terms)
+    found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), arrays)
+    return (*map(torch.from_numpy, found),)
 
 
 def reduced_of(known: KnownQP) -> Reduced:

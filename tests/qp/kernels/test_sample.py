@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +10,19 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import KnownQP, known_qp, programs_of, random_mpc, random_states
+from tests.problems import (
+    KnownQP,
+    certified,
+    in_torch,
+    known_qp,
+    programs_of,
+    random_mpc,
+    random_states,
+)
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.kernels.sample import CLOSE
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.device import on_device
 from torch_qpmpc.qp.solvers import BackendSolution, daqp
 
 BATCH = 6
@@ -34,12 +40,6 @@ SPOILERS = {
     "inf in z": lambda parts: parts["z"][4, 5].fill_(-torch.inf),
     "overflow": lambda parts: parts["z"].mul_(1e200),
 }
-
-
-def in_torch(programs: Programs) -> tuple[Any, ...]:
-    """Return the arguments of the torch forms after the candidate, on the CPU."""
-    group, fixed = torch.from_numpy(programs.group), torch.from_numpy(programs.fixed)
-    return group, fixed, *on_device(programs, torch.device("cpu"))
 
 
 def reference(known: KnownQP, **candidate: Tensor) -> float:
@@ -82,8 +82,7 @@ def test_the_residual_is_the_certificates(name):
         expected = reference(known, **candidate)
         batch = {n: x.unsqueeze(0) for n, x in candidate.items()}
         p = programs_of(replace(known, fixed=known.fixed.unsqueeze(0)))
-        ours = p.certify(**{n: x.numpy() for n, x in batch.items()})[1]
-        others = sample_torch.certify(*batch.values(), *in_torch(p))[1]
+        ours, others = (certified(p, *batch.values(), compiled=c)[1] for c in (True, False))
         assert_close(others.item(), float(expected), rtol=1e-9, atol=1e-13)
         # A bound of the terms of a row, until they are summed.
         near = 0.0 if expected > CLOSE else CLOSE
@@ -102,9 +101,8 @@ def test_the_certificate_is_that_of_torch(name, matrices):
 
 def assert_certified_alike(known: KnownQP, candidate: dict[str, Tensor]) -> Tensor:
     compiled = programs_of(known)
-    found = compiled.certify(**{n: x.numpy() for n, x in candidate.items()})
-    value, residual, error = map(to_tensor, found)
-    of_torch = sample_torch.certify(*candidate.values(), *in_torch(compiled))
+    value, residual, error = certified(compiled, *candidate.values())
+    of_torch = certified(compiled, *candidate.values(), compiled=False)
     assert_close(residual, of_torch[1], rtol=1e-9, atol=CLOSE)
     known_to_both = of_torch[2].isfinite()
     assert_close(error[known_to_both], of_torch[2][known_to_both], rtol=1e-9, atol=1e-13)

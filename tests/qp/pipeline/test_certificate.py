@@ -10,12 +10,10 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, known_qp, programs_of, times
+from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, certified, known_qp, programs_of, times
 from torch_qpmpc import QuadraticProgram, Status
-from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.pipeline.device import on_device
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import TOLERANCE
 from torch_qpmpc.qp.solvers.interior_point import BatchedQPs
@@ -32,8 +30,7 @@ class Certificate(NamedTuple):
 
 def certify(p: Programs, *claim: Tensor) -> Certificate:
     """Certify with the compiled loops; `tests.qp.kernels.test_sample` compares the torch forms."""
-    found = p.certify(*(x.numpy() for x in claim))
-    return Certificate(*map(torch.from_numpy, found))
+    return Certificate(*certified(p, *claim))
 
 
 def judge(known: KnownQP, **claim: Tensor) -> Certificate:
@@ -352,9 +349,7 @@ def test_the_certificates_judge_a_row_alike(low, length, off, right):
     if units is not None:
         z, lam = z / torch.as_tensor(units.length), lam * torch.as_tensor(units.rows / units.cost)
     claim = z, lam, z[:, :0], z[:, :0]
-    residual = programs.certify(*(x.numpy() for x in claim))[1]
-    rest = (torch.from_numpy(x) for x in (programs.group, programs.fixed))
-    of_torch = sample_torch.certify(*claim, *rest, *on_device(programs, torch.device("cpu")))[1]
+    residual, of_torch = (certified(programs, *claim, compiled=c)[1] for c in (True, False))
     method = BatchedQPs.of(SoftQPs._make(map(to_tensor, programs.reduced_qps())))
     for found in (residual, of_torch, method.residual(z, lam)):
         assert (found[0] <= TOLERANCE) == right

@@ -10,7 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.benchmarks.stays import of_value
-from tests.problems import KnownQP, known_qp, normal
+from tests.problems import KnownQP, certified, known_qp, normal
 from torch_qpmpc import QPMPC, QPError, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
@@ -139,7 +139,7 @@ def test_rounding_of_multipliers_that_cancel_is_no_error_of_the_value(speed, rig
     z[0, 3], z[0, 6] = speed, 0.02 * speed
     lam[0, 0::4], lam[0, 2::4] = 0.7, -0.7 / 0.3
     assert (lam @ qp.G).abs().max() > 0
-    _, residual, error = p.certify(*(x.numpy() for x in (z, lam, chi, chi[:, :0])))
+    _, residual, error = certified(p, z, lam, chi, chi[:, :0])
     assert residual[0] <= 1e-6
     assert (error[0] <= 1e-6) == right
 

@@ -154,7 +154,7 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     for i in range(n_qps):
         add(left[i, :n_f], 1.0, xi[i])
     terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
-    value, residual, error = _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
+    value, residual, error = judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
     status = np.full(n_qps, NOT_CONVERGED)
     for i in range(n_qps):
         if residual[i] <= TOLERANCE and error[i] <= TOLERANCE:
@@ -196,24 +196,16 @@ def _all_multipliers(lam_v, y, theta, rows, others):
 
 
 @compiled
-def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes):
-    """Return value, KKT residual and the value's error ``(B,)``."""
-    H, C, G, q = theta.H, theta.C, theta.G, theta.q
-    of_H, of_C, of_G, _, _ = sizes.spans
-    Hz, y = products(H, group, z, of_H), products(G, group, z, of_G)
-    G_lam = transposed_products(G, group, lam, of_G)
-    C_chi, Cz = transposed_products(C, group, chi, of_C), products(C, group, z, of_C)
-    left = Hz + G_lam + C_chi
-    for i in range(len(z)):
-        add(left[i, : xi.shape[1]], 1.0, xi[i])
-        add(left[i], 1.0, q[i % len(q)])
-    terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
-    return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
+def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
+    """Certify z, lam and chi with their KKT `Terms`.
 
-
-@compiled
-def _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
-    """Return value, residual and error of the value from the KKT `Terms`."""
+    Returns:
+        The value, the residual and the error of the value, ``(B,)``. The residual is the largest
+        error in stationarity, C z = b, the fixed entries, hard rows, and multipliers (outside
+        [-w, w] or at absent bounds), each relative to the size of its terms; or, if larger, the sum
+        of the errors in C z = b, weighted by |chi|, and of the rows' complementarity gaps, relative
+        to the cost.
+    """
     Hz, G_lam, C_chi, left, y, Cz = terms
     H, C, G = theta.H, theta.C, theta.G
     q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w

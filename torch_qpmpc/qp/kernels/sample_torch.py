@@ -46,25 +46,14 @@ def recover(v, lam, iterations, group, fixed, theta, reduced, sizes) -> tuple[Te
     xi = -left[:, : fixed.shape[-1]]
     left[:, : fixed.shape[-1]] += xi
     terms = Terms(Hz, G_lam, C_chi, left, y, multiply(C, group, z))
-    value, *errors = _judge(z, all_lam, chi, group, fixed, theta, reduced, sizes, terms)
+    value, *errors = judge(z, all_lam, chi, group, fixed, theta, reduced, sizes, terms)
     solved = (errors[0] <= TOLERANCE) & (errors[1] <= TOLERANCE)
     status = torch.where(solved, SOLVED, NOT_CONVERGED)
     codes = active_codes(y, all_lam, theta.lb, theta.ub, theta.w)
     return value, z, chi, all_lam, xi, status, *errors, iterations, codes
 
 
-def certify(z, lam, chi, xi, group, fixed, theta, reduced, sizes) -> tuple[Tensor, ...]:
-    Hz, y = multiply(theta.H, group, z), multiply(theta.G, group, z)
-    G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
-    left = Hz + theta.q + G_lam + C_chi
-    left[:, : xi.shape[-1]] += xi
-    terms = Terms(Hz, G_lam, C_chi, left, y, multiply(theta.C, group, z))
-    return _judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
-
-
-def _judge(
-    z, lam, chi, group, fixed, theta, reduced, sizes, terms
-) -> tuple[Tensor, Tensor, Tensor]:
+def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms) -> tuple[Tensor, Tensor, Tensor]:
     Hz, G_lam, C_chi, left, y, Cz = terms
     lb, ub, w = theta.lb, theta.ub, theta.w
     hard, no_lb, no_ub = w.isinf(), lb.isinf(), ub.isinf()

@@ -11,8 +11,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, TypeVar
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -43,9 +43,23 @@ from torch_qpmpc.qp.pipeline.condensing import (
 from torch_qpmpc.qp.pipeline.scaling import Units
 from torch_qpmpc.qp.program import NDIMS, UNKNOWN, broadcast
 
+P = ParamSpec("P")
 T = TypeVar("T")
 #: The positions of H, C and G.
 MATRICES = (0, 3, 5)
+
+
+def kept(make: Callable[Concatenate[Prepared, P], T]) -> Callable[Concatenate[Prepared, P], T]:
+    """Keep what a function of prepared QPs returns for its other arguments."""
+
+    @wraps(make)
+    def get(self: Prepared, *args: P.args, **kwargs: P.kwargs) -> T:
+        key = make.__name__, *args
+        if key not in self.known:
+            self.known[key] = make(self, *args, **kwargs)
+        return self.known[key]
+
+    return get
 
 
 class Prepared:
@@ -65,7 +79,7 @@ class Prepared:
     ) -> None:
         self.theta, self.group, self.n_kept = theta, group, n_kept
         self._elimination = elimination
-        self._known: dict[Any, Any] = {}
+        self.known: dict[tuple, Any] = {}
 
     @cached_property
     def shared(self) -> bool:
@@ -103,54 +117,50 @@ class Prepared:
         deficient = condensed.deficient and self.n_kept > n_f
         return self._condensed(n_f) if deficient else condensed
 
+    @kept
     def _condensed(self, n_kept: int) -> Condensed:
-        return self.once(
-            ("condensed", n_kept), lambda: condense(self.theta, n_kept, self._elimination)
-        )
+        return condense(self.theta, n_kept, self._elimination)
 
+    @kept
     def reduced(self, n_f: int) -> Reduced:
         """Return the QPs in their free variables."""
-        return self.once(
-            ("reduced", n_f), lambda: reduce(self.condensed(n_f), self.theta, self.group, n_f)
-        )
+        return reduce(self.condensed(n_f), self.theta, self.group, n_f)
 
+    @kept
     def convex(self, n_f: int) -> np.ndarray | None:
         """Return the mask of positive semidefinite reduced H, ``(M,)``; None if all are."""
-        if self.condensed(n_f).surely_convex:
-            return None
-        mask = self.once(("convex", n_f), lambda: convex(self.reduced(n_f).H))
-        return None if mask.all() else mask
+        surely = self.condensed(n_f).surely_convex
+        return None if surely or (mask := convex(self.reduced(n_f).H)).all() else mask
 
+    @kept
     def sensitivities(self, n_f: int) -> Sensitivities:
         """Return the `Sensitivities` of the reduced QPs."""
-        return self.once(("sensitivities", n_f), lambda: sensitivities(self.reduced(n_f)))
+        return sensitivities(self.reduced(n_f))
 
+    @kept
     def sizes(self, n_f: int) -> Sizes:
         """Return the `Sizes` of the reduced QPs."""
-        return self.once(("sizes", n_f), lambda: sizes(self.condensed(n_f), self.theta, n_f))
+        return sizes(self.condensed(n_f), self.theta, n_f)
 
+    @kept
     def dual(self, n_f: int, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return K = G H^-1 G' with a unit diagonal, its units, and the map of -g to the rows.
 
         They are ``(M, r, r)``, ``(M, r)`` and ``(M, r, d)``. ``least`` is added to H's diagonal.
         """
-
-        def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            _, _, H, G, *_ = self.reduced(n_f)
-            inverse, _ = inverse_factors(H + least * np.eye(H.shape[-1]))
-            R = G @ inverse.swapaxes(1, 2)
-            unit = np.linalg.norm(R, axis=-1)
-            R = R / unit[:, :, None]
-            return R @ R.swapaxes(1, 2), unit, R @ inverse
-
-        return self.once(("dual", n_f, least), make)
+        _, _, H, G, *_ = self.reduced(n_f)
+        inverse, _ = inverse_factors(H + least * np.eye(H.shape[-1]))
+        R = G @ inverse.swapaxes(1, 2)
+        unit = np.linalg.norm(R, axis=-1)
+        R = R / unit[:, :, None]
+        return R @ R.swapaxes(1, 2), unit, R @ inverse
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""
         theta = self.theta._replace(lb=lb, ub=ub)
         other = Prepared(theta, self.group, self.n_kept, self._elimination)
-        same = ("condensed", "convex", "sensitivities", "sizes")
-        other._known = {name: x for name, x in self._known.items() if name[0] in same}
+        same = ("_condensed", "convex", "sensitivities", "sizes")
+        other.known = {key: x for key, x in self.known.items() if key[0] in same}
         vars(other)["units"] = self.units
         if self.units is not None:
             rows = per_qp(self.units.rows, self.group)
@@ -168,12 +178,6 @@ class Prepared:
     def eliminated(self, elimination: Elimination, n_f: int) -> Prepared:
         """Return the same theta with another elimination of C z = b, which keeps n_f entries."""
         return Prepared(self.theta, self.group, n_f, elimination)
-
-    def once(self, name: Any, make: Callable[[], T]) -> T:
-        """Return what ``make`` made at the first call with this ``name``."""
-        if name not in self._known:
-            self._known[name] = make()
-        return self._known[name]
 
 
 #: The latest thetas that are kept: V and Q of an online and a target network.
@@ -328,7 +332,7 @@ class Programs:
         The residual is infinite where a set does not.
         """
         sensitivities = self.prepared.sensitivities(self.n_f)
-        return BatchSolution(*sample.recall(active, sensitivities, *self._data()))
+        return BatchSolution(*sample.recall(active, sensitivities, *self.data()))
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -336,23 +340,10 @@ class Programs:
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
         elimination.
         """
-        return BatchSolution(*sample.recover(*candidate, *self._data(), passes))
+        return BatchSolution(*sample.recover(*candidate, *self.data(), passes))
 
-    def certify(
-        self, z: np.ndarray, lam: np.ndarray, chi: np.ndarray, xi: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Certify z ``(B, n_z)`` and lam ``(B, n_g)``, chi ``(B, n_c)``, xi ``(B, n_f)``.
-
-        Returns:
-            The value, the residual and the error of the value, ``(B,)``. The residual is the
-            largest error in stationarity, C z = b, the fixed entries, hard rows, and multipliers
-            (outside [-w, w] or at absent bounds), each relative to the size of its terms; or, if
-            larger, the sum of the errors in C z = b, weighted by |chi|, and of the rows'
-            complementarity gaps, relative to the cost.
-        """
-        return sample.certify(z, lam, chi, xi, *self._data())
-
-    def _data(self) -> tuple:
+    def data(self) -> tuple:
+        """Return the kernels' arguments after the candidate."""
         prepared, n_f = self.prepared, self.n_f
         return self.group, self.fixed, self.theta, prepared.reduced(n_f), prepared.sizes(n_f)
 

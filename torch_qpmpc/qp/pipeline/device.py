@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels import sample_torch
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs, Theta, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, kept
 from torch_qpmpc.qp.pipeline.condensing import Reduced, Sizes
 from torch_qpmpc.qp.program import Status
 from torch_qpmpc.qp.solvers import interior_point
@@ -28,7 +28,7 @@ def attempt(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
     """Return candidates of the interior-point method on ``device``, completed and certified."""
     if not len(programs) or not len(programs.prepared.reduced(programs.n_f).rows):
         return programs.unsolved(Status.NOT_CONVERGED)
-    theta, reduced, sizes = on_device(programs, device)
+    theta, reduced, sizes = on_device(programs.prepared, device, programs.n_f)
     group, fixed = (torch.from_numpy(x).to(device) for x in (programs.group, programs.fixed))
     qps = reduced_qps(reduced, group, fixed)
     found = interior_point.solve(qps)
@@ -36,19 +36,16 @@ def attempt(device: torch.device, programs: Programs, _: Any) -> BatchSolution:
     return BatchSolution._make(map(to_numpy, parts))
 
 
-def on_device(programs: Programs, device: torch.device) -> tuple[Theta, Reduced, Sizes]:
+@kept
+def on_device(prepared: Prepared, device: torch.device, n_f: int) -> tuple[Theta, Reduced, Sizes]:
     """Return theta and what follows from it as tensors, copied once for each theta."""
-    prepared, n_f = programs.prepared, programs.n_f
 
     def moved(x: Any) -> Any:
         if isinstance(x, np.ndarray):
             return torch.from_numpy(x).to(device)
         return type(x)._make(map(moved, x)) if hasattr(x, "_make") else x
 
-    def parts() -> tuple[Theta, Reduced, Sizes]:
-        return moved(prepared.theta), moved(prepared.reduced(n_f)), moved(prepared.sizes(n_f))
-
-    return prepared.once(("on device", device, n_f), parts)
+    return moved(prepared.theta), moved(prepared.reduced(n_f)), moved(prepared.sizes(n_f))
 
 
 def reduced_qps(reduced: Reduced, group: Tensor, fixed: Tensor) -> SoftQPs:

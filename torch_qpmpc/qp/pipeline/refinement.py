@@ -329,15 +329,14 @@ class _Point(NamedTuple):
         scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
         bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
         gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
-        slip = np.abs(errors[: len(z) - n_f]) @ np.abs(z[n_f:]) + np.abs(gap).sum()
-        slip += np.abs(errors[len(z) - n_f :][:n_c]) @ np.abs(chi)
+        of_slope, of_C, _ = np.split(np.abs(errors), (len(z) - n_f, len(z) - n_f + n_c))
+        slip = of_slope @ np.abs(z[n_f:]) + np.abs(gap).sum() + of_C @ np.abs(chi)
         force = np.stack((np.abs(qp.H) @ np.abs(z) + np.abs(qp.q), np.abs(qp.G.T) @ np.abs(lam)))
         force = (force.sum(0) + np.abs(qp.C.T) @ np.abs(chi))[n_f:]
         short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), qp.row_sizes(z)))
-        off = np.abs(np.concatenate((errors[len(z) - n_f :][:n_c], hard * beyond)))
         # Rows that contradict each other are held in the middle: no further than is infeasible.
-        off *= TOLERANCE / CONTRADICTED
-        residual = max(_ratio(np.abs(errors[: len(z) - n_f]), force), _ratio(off, short))
+        off = np.concatenate((of_C, hard * beyond)) * (TOLERANCE / CONTRADICTED)
+        residual = max(_ratio(of_slope, force), _ratio(off, short))
         xi = -(self.slope.high + qp.q + qp.G.T @ lam + qp.C.T @ chi)[:n_f]
         error = slip / scale
         right = residual <= TOLERANCE and error <= TOLERANCE
