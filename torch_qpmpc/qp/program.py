@@ -158,7 +158,13 @@ class QuadraticProgram:
     n_known: InitVar[int] = dataclasses.field(default=0, kw_only=True)
 
     def __post_init__(self, check_values: bool, n_known: int) -> None:
-        self._check_shapes()
+        self._check_events()
+        try:
+            _ = self.batch_shape
+        except RuntimeError as error:
+            shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
+            want = "leading dimensions that broadcast"
+            raise QPError.expected("batch", f"shapes {shapes}", want) from error
         if n_known != 0:
             check_whole("n_known", n_known, 0)
         if check_values:
@@ -183,16 +189,6 @@ class QuadraticProgram:
     def tensors(self) -> tuple[Tensor, ...]:
         """Return H, q, c, C, b, G, lb, ub, w."""
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
-
-    def _check_shapes(self) -> None:
-        self._check_events()
-        try:
-            _ = self.batch_shape
-        except RuntimeError as error:
-            shapes = {name: tuple(getattr(self, name).shape) for name in EVENT_SHAPES}
-            raise QPError.expected(
-                "batch", f"shapes {shapes}", "leading dimensions that broadcast"
-            ) from error
 
     def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):

@@ -19,8 +19,8 @@ magnitude. One d x d Cholesky factor without pivoting suffices, even for depende
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -67,8 +67,7 @@ LATE, CAUTION = 20, 0.3
 SHRINK = 0.75
 
 
-@dataclass(frozen=True)
-class BatchedQPs:
+class BatchedQPs(NamedTuple):
     """`SoftQPs` with `HUGE` for infinity, and typical sizes.
 
     H and G are ``(1, ..)`` if the batch shares them, and ``products`` then holds the outer products
@@ -124,14 +123,11 @@ class BatchedQPs:
         typical = (width, force, penalty, cost, curvature)
         return cls(H, G, products, g, lower, upper, w, *typical)
 
-    def __len__(self) -> int:
-        return len(self.g)
-
     def take(self, index: Tensor) -> BatchedQPs:
         """Return the QPs at ``index``."""
         same = ("H", "G", "products") if self.products is not None else ("products",)
-        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
-        return BatchedQPs(**{n: t if n in same else t[index] for n, t in tensors.items()})
+        pairs = self._asdict().items()
+        return BatchedQPs(**{n: x if n in same else x[index] for n, x in pairs})
 
     def apply_H(self, v: Tensor) -> Tensor:
         """Return H v, ``(B, d)``."""
@@ -182,8 +178,7 @@ class BatchedQPs:
         return torch.bmm(matrices, vectors.unsqueeze(-1)).squeeze(-1)
 
 
-@dataclass
-class Best:
+class Best(NamedTuple):
     """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
 
     v: Tensor
@@ -201,7 +196,7 @@ class Best:
 
 def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
     """Take one or more Newton steps from v and lam, until the residual of each QP is `SETTLED`."""
-    todo = torch.arange(len(qps), device=v.device)
+    todo = torch.arange(len(qps.g), device=v.device)
     best = Best(v.clone(), lam.clone(), qps.residual(v, lam), torch.zeros_like(todo))
     for _ in range(max_steps):
         v, lam = _newton_step(qps, v, lam)
@@ -241,7 +236,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
     form = BatchedQPs.of(qps)
-    point, todo = _begin(form), torch.arange(len(form), device=qps.g.device)
+    point, todo = _begin(form), torch.arange(len(form.g), device=qps.g.device)
     unsolved = torch.full_like(form.cost, torch.inf)
     best = Best(torch.zeros_like(form.g), torch.zeros_like(form.w), unsolved, point.steps.clone())
     for target, limit in TARGETS:
@@ -262,8 +257,7 @@ def solve_arrays(qps: SoftQPs) -> BackendSolution:
     return BackendSolution._make(x.numpy() for x in solve(SoftQPs._make(map(to_tensor, qps))))
 
 
-@dataclass
-class Point:
+class Point(NamedTuple):
     """The current iterates of a batch.
 
     v ``(B, d)``; ``primal`` and ``dual``, the pairs ``(B, 2, 2, r)`` of (s, t) with (lam, mu) for
@@ -292,12 +286,12 @@ class Point:
 
     def take(self, index: Tensor) -> Point:
         """Return a copy of the points at ``index``."""
-        return Point(*(getattr(self, field.name)[index] for field in fields(self)))
+        return Point._make(x[index] for x in self)
 
     def put(self, index: Tensor, other: Point) -> None:
         """Replace the points at ``index``."""
-        for field in fields(self):
-            getattr(self, field.name)[index] = getattr(other, field.name)
+        for own, new in zip(self, other, strict=True):
+            own[index] = new
 
 
 def _begin(qps: BatchedQPs) -> Point:
@@ -339,7 +333,7 @@ def _begin(qps: BatchedQPs) -> Point:
 
 def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
     """Iterate ``end`` in place until its gaps are below ``target``, at most ``limit`` times."""
-    todo, point = torch.arange(len(qps), device=end.v.device), end
+    todo, point = torch.arange(len(qps.g), device=end.v.device), end
     for _ in range(limit):
         products = point.primal * point.dual
         gap = products.sum((1, 2, 3))
@@ -395,7 +389,7 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     ahead = STEP / -torch.minimum(*ends).clamp(max=-STEP)
     failed = ~ahead.isfinite()
     if failed.any():
-        point.lost |= failed
+        point.lost.logical_or_(failed)
         for x in (dv, dy, dlam, change, ahead):
             x[failed] = 0
     ahead *= going
@@ -404,4 +398,4 @@ def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: T
     dual.addcmul_(ahead[:, None, None, None], dlam)
     point.equality.addcmul_(ahead[:, None], hold * (dy - short))
     point.astray.mul_(1 - ahead)
-    point.steps += going
+    point.steps.add_(going)
