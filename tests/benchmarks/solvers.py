@@ -113,7 +113,7 @@ def condensing(mpc: QPMPC, size: Size) -> Solve:
         nudge(mpc)
         n = size.n_x + size.n_u
         programs, _ = Programs.of(*mpc.quadratic_program().tensors(), s, n_kept=n)
-        return torch.from_numpy(programs.prepared.condensed(n).arrays.T[0])
+        return torch.from_numpy(programs.prepared.condensed(n).T[0])
 
     return once
 

@@ -84,7 +84,7 @@ def _solve_kkt(
 ) -> tuple[Tensor, ...]:
     n_f, theta = programs.n_f, programs.prepared.theta
     group, H, C, G = map(to_tensor, (programs.group, theta.H, theta.C, theta.G))
-    T, Y_neg, H_y, G_y, _, _ = map(to_tensor, programs.prepared.condensed(n_f).arrays)
+    T, Y_neg, H_y, G_y = map(to_tensor, programs.prepared.condensed(n_f)[:4])
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
@@ -119,7 +119,7 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     held &= entering
     lower, upper = free & (y - lb <= near), free & (ub - y <= near)
     if (weak := (lower | upper).any(-1)).any():
-        G = condensed.arrays.G[:, :, programs.n_f :]
+        G = condensed.G[:, :, programs.n_f :]
         masks = (x[weak].numpy() for x in (lower, upper, held))
         held[weak] |= torch.from_numpy(_all_implied(G, programs.group[weak.numpy()], *masks))
     return held

@@ -57,7 +57,7 @@ def test_elimination_spans_the_solutions_of_the_equalities(name):
     n_kept = 3
     condensed = condense(theta_of(H + H.mT, C, G), n_kept)
     assert condensed.deficient == (name in DEFICIENT)
-    T, Y_neg, H_y, G_y, _, _ = map(torch.from_numpy, condensed.arrays)
+    T, Y_neg, H_y, G_y = map(torch.from_numpy, condensed[:4])
     assert_close(T[0, :n_kept], torch.eye(n_kept, T.shape[-1]).double())
     n_free = 8 - n_kept - int(torch.linalg.matrix_rank(C[0, :, n_kept:]))
     assert T.shape[-1] - n_kept == n_free

@@ -8,7 +8,6 @@ Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the lin
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -50,8 +49,15 @@ class Elimination(NamedTuple):
     padding: np.ndarray | None
 
 
-class CondensedArrays(NamedTuple):
-    """T, -Y, T'HT, GT, and the factors T'HY and GY of b. All have a leading M."""
+class Condensed(NamedTuple):
+    """The QPs' matrices in y: T, -Y, T'HT, GT, and the factors T'HY and GY of b, with a leading M.
+
+    ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
+    after the kept entries do not have full row rank, and the arrays are valid only for QPs that fix
+    exactly these. ``enters`` ``(n_g, n_y)`` is True where a row of G contains a variable of y, but
+    for rounding, relative to its ``terms`` ``(M, n_g)`` before the elimination. ``sums`` are those
+    of the absolute entries in the rows of H, G and C.
+    """
 
     T: np.ndarray
     Y_neg: np.ndarray
@@ -59,24 +65,9 @@ class CondensedArrays(NamedTuple):
     G: np.ndarray
     H_b: np.ndarray
     G_b: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Condensed:
-    """The QPs' matrices in y.
-
-    ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
-    after ``n_kept`` do not have full row rank, and the arrays are valid only for QPs that fix
-    exactly ``n_kept`` entries. ``enters`` ``(n_g, n_y)`` is True where a row of G
-    contains a variable of y, but for rounding, relative to its ``terms`` ``(M, n_g)`` before the
-    elimination. ``sums`` are those of the absolute entries in the rows of H, G and C.
-    """
-
-    arrays: CondensedArrays
     enters: np.ndarray
     terms: np.ndarray
     sums: tuple[np.ndarray, np.ndarray, np.ndarray]
-    n_kept: int
     deficient: bool
     surely_convex: bool
 
@@ -169,12 +160,12 @@ def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) 
     terms = np.abs(theta.G) @ row_sums(T)[:, :, None]
     enters = (np.abs(G) > ENTERS * terms).any(0)
     sums = row_sums(theta.H), row_sums(theta.G), row_sums(theta.C)
-    arrays = CondensedArrays(T, Y_neg, H, G, H_b, G_b)
     # Cholesky factors prove it; eigenvalues take many times as long.
     shift = CONVEX * (1 + H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0))
     shifted = torch.from_numpy(H + shift[:, None, None] * np.eye(H.shape[1]))
     convex = padding is None and not torch.linalg.cholesky_ex(shifted).info.any()
-    return Condensed(arrays, enters, terms[:, :, 0], sums, n_kept, padding is not None, convex)
+    deficient = padding is not None
+    return Condensed(T, Y_neg, H, G, H_b, G_b, enters, terms[:, :, 0], sums, deficient, convex)
 
 
 def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -187,7 +178,7 @@ def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 @np.errstate(all="ignore")
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
     """Reduce condensed QPs to those with the first n_f entries fixed."""
-    T, Y_neg, H, G, H_b, G_b = condensed.arrays
+    T, Y_neg, H, G, H_b, G_b, *_ = condensed
     bounded = ((theta.lb > -np.inf) | (theta.ub < np.inf)).any(0)
     entering = bounded & condensed.enters[:, n_f:].any(-1)
     rows, others = np.flatnonzero(entering), np.flatnonzero(~entering)
@@ -216,8 +207,8 @@ def _times(matrices: np.ndarray, group: np.ndarray, vectors: np.ndarray) -> np.n
 @np.errstate(all="ignore")
 def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     """Return the `Sizes` of QPs with the first n_f entries fixed."""
-    H = np.ascontiguousarray(condensed.arrays.H[:, n_f:, n_f:])
-    G = np.ascontiguousarray(condensed.arrays.G[:, :, n_f:])
+    H = np.ascontiguousarray(condensed.H[:, n_f:, n_f:])
+    G = np.ascontiguousarray(condensed.G[:, :, n_f:])
     steps = np.linalg.norm(G, axis=-1)
     steps[steps <= ABSENT * condensed.terms] = 0.0
     enters = condensed.enters[:, n_f:]
@@ -234,7 +225,7 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     inverse, shift = inverse_factors(H)
     stiffness = row_sums(H).max(-1, initial=0.0)
     rows = steps, hard, box, bounds, units, apart
-    spans = tuple(map(kernels.row_spans, (*theta[:3], *condensed.arrays[:2])))
+    spans = tuple(map(kernels.row_spans, (*theta[:3], *condensed[:2])))
     return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, spans)
 
 

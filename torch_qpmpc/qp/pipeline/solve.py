@@ -149,20 +149,16 @@ def solve_now(*arguments: Any) -> BatchSolution:
 
 def report(status: np.ndarray, batch: torch.Size, on_failure: str) -> None:
     """Raise or warn about the unsolved QPs of a batch, by their `Status` ``(B,)``."""
-    statuses = torch.as_tensor(status)
-    failed = statuses.nonzero().squeeze(-1)
-    reasons = []
-    for kind in Status:
-        where = (statuses == kind).nonzero().squeeze(-1)
-        if kind != Status.SOLVED and len(where):
-            first = torch.unravel_index(where[0], batch) if batch else ()
-            at = f", first at batch index {tuple(int(i) for i in first)}" if batch else ""
+    unsolved, reasons = np.flatnonzero(status), []
+    for kind in list(Status)[1:]:
+        if len(where := np.flatnonzero(status == kind)):
+            first = tuple(map(int, np.unravel_index(where[0], batch))) if batch else ()
+            at = f", first at batch index {first}" if batch else ""
             reasons.append(f"{len(where)} {kind.name}{at}: {kind.explanation}")
-    message = f"{len(failed)} of {len(statuses)} QPs have no certified solution. " + ". ".join(
-        reasons
-    )
+    text = ". ".join(reasons)
+    message = f"{len(unsolved)} of {len(status)} QPs have no certified solution. {text}"
     if on_failure == "raise":
-        if (statuses[failed] == Status.INVALID_DATA).all():
+        if (status[unsolved] == Status.INVALID_DATA).all():
             raise QPError(message)
         raise SolverError(message)
     warnings.warn(message, RuntimeWarning, stacklevel=2)
