@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import copy
 import functools
+import os
+import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -79,6 +82,15 @@ def run_command(*arguments: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train.py", "--config-path", str(CONFIGS), *arguments, *quiet])
         train.main()
+
+
+def ended(*words: object, cwd: Path = CONFIGS.parent, **environment: str) -> Any:
+    """Run a command of another process to its end, which is a success."""
+    as_text: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 1200}
+    command, variables = [*map(str, words)], os.environ | environment
+    process = subprocess.run(command, cwd=cwd, env=variables, check=False, **as_text)
+    assert process.returncode == 0, f"{process.stdout[-2000:]}\n{process.stderr[-3000:]}"
+    return process
 
 
 def choices(group: str) -> list[str]:

@@ -14,7 +14,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.pages import PAGES, ROOT, fenced, needs_docs
-from tests.runs import SMALL, run_command
+from tests.runs import SMALL, ended, run_command
 
 pytestmark = needs_docs
 
@@ -107,11 +106,9 @@ SHORT = {
     ),
     "python train.py -m task.file=docs/examples/short_horizon.py weighted=true eval_seed=777 "
     "seed=range(111,121)": Short(SWEEP),
-    "python -m torch_qpmpc.report runs/study-paper": Short("runs/study-paper"),
-    "python -m torch_qpmpc.report runs/study-paper --page docs/results/paper.md": Short(
-        "runs/study-paper --page docs/results/paper.md"
-    ),
-    "python -m torch_qpmpc.report runs/study-frontier": Short("runs/study-frontier"),
+    "python -m torch_qpmpc.report runs/study-paper": Short(),
+    "python -m torch_qpmpc.report runs/study-paper --page docs/results/paper.md": Short(),
+    "python -m torch_qpmpc.report runs/study-frontier": Short(),
     # A script of one's own.
     "python train.py task.file=my_task.py solver=daqp hydra.run.dir=pole": Short(
         FEW, files=MY_TASK
@@ -218,7 +215,7 @@ def test_the_commands_of_a_page_end(page, tmp_path, capsys):
     skip = shutil.ignore_patterns(".*", "venv", "runs", "site")
     clone = Path(shutil.copytree(ROOT, tmp_path / "clone", ignore=skip))
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(clone), "OMP_NUM_THREADS": "1"}
+    variables = {"PATH": path, "PYTHONPATH": str(clone), "OMP_NUM_THREADS": "1"}
     blocks = [code for _, code in fenced(PAGES.get(page, ""), "python")]
     for command in DOCUMENTED[page]:
         short, began = NAMED.get(command), time.perf_counter()
@@ -232,16 +229,6 @@ def test_the_commands_of_a_page_end(page, tmp_path, capsys):
         for name, part in short.files:
             script = next(code for code in blocks if part in code)
             (clone / name).write_text(script, encoding="utf-8")
-        words = short.instead or f"{command} {short.more}"
-        ended = subprocess.run(
-            ["bash", "-c", words],
-            cwd=clone,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=1200,
-            check=False,
-        )
+        ended("bash", "-c", short.instead or f"{command} {short.more}", cwd=clone, **variables)
         with capsys.disabled():
             print(f"\n{time.perf_counter() - began:8.1f} s  {command}", end="")
-        assert ended.returncode == 0, f"{words}\n{ended.stdout[-2000:]}\n{ended.stderr[-3000:]}"

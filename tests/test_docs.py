@@ -6,17 +6,15 @@ import doctest
 import importlib
 import importlib.util
 import json
-import os
 import re
 import shlex
-import subprocess
 import sys
 
 import pytest
 
 import torch_qpmpc
 from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
-from tests.runs import SMALL, make_config
+from tests.runs import SMALL, ended, make_config
 from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.experiment.tasks.code import named_task
@@ -113,19 +111,10 @@ def test_the_task_of_the_guide_trains(tmp_path):
     (tmp_path / "my_task.py").write_text(script, encoding="utf-8")
     small = (*SMALL, "task.horizon=10", "figures=false", "hydra.launcher.n_jobs=2")
     command = [sys.executable, "my_task.py", "-m", "task=pole", "seed=1,2", *small]
-    ended = subprocess.run(
-        [*command, "hydra.sweep.dir=sweep"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stderr
-    assert "2 out of   2" in ended.stderr
-    assert "deviation, none" not in ended.stderr, "a run's own bar"
-    assert "closed gap" not in ended.stdout, "a run's own table"
+    sweep = ended(*command, "hydra.sweep.dir=sweep", cwd=tmp_path, PYTHONPATH=str(ROOT))
+    assert "2 out of   2" in sweep.stderr
+    assert "deviation, none" not in sweep.stderr, "a run's own bar"
+    assert "closed gap" not in sweep.stdout, "a run's own table"
     summary = json.loads((tmp_path / "sweep/none-identified-seed2/summary.json").read_text())
     assert (summary["task"], summary["seed"], summary["updates"]) == ("pole", 2, 4)
     assert summary["J_true_model"] < summary["J_start"]

@@ -14,23 +14,12 @@ from pathlib import Path
 import pytest
 
 import torch_qpmpc
+from tests.runs import ended
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / ".github" / "readme_examples.py"
 
 pytestmark = pytest.mark.skipif(not EXAMPLES.exists(), reason="not a clone of the repository")
-
-
-def run(*command: str | Path) -> None:
-    ended = subprocess.run(
-        [sys.executable, *map(str, command)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stdout + ended.stderr
 
 
 def sources(folder: str) -> set[str]:
@@ -43,7 +32,7 @@ def sources(folder: str) -> set[str]:
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The sdist and the wheel."""
     folder = tmp_path_factory.mktemp("dist")
-    run("-m", "hatchling", "build", "-d", folder)
+    ended(sys.executable, "-m", "hatchling", "build", "-d", folder)
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
     return sdist, wheel
 
@@ -77,9 +66,9 @@ def test_the_module_of_the_wheel_is_its_own_train_py(built, tmp_path):
     command = [sys.executable, "-m", "torch_qpmpc.train", "task.gama=1"]
     options = {"cwd": tmp_path, "capture_output": True, "text": True}
     environment = os.environ | {"PYTHONPATH": str(folder)}
-    ended = subprocess.run(command, check=False, env=environment, **options)
-    assert ended.returncode == 1
-    assert ended.stderr.endswith("Did you mean task.gamma?\n")
+    refused = subprocess.run(command, check=False, env=environment, **options)
+    assert refused.returncode == 1
+    assert refused.stderr.endswith("Did you mean task.gamma?\n")
     assert not [*tmp_path.iterdir()]
 
 

@@ -35,9 +35,9 @@ def keys_of_the_files() -> set[str]:
     return keys
 
 
-def test_each_key_of_the_files_is_one_of_the_models_and_there_are_at_most_80():
+def test_each_key_of_the_files_is_one_of_the_models_and_there_are_at_most_72():
     assert keys_of_the_files() - OPTIONAL == KEYS
-    assert len(KEYS) <= 80
+    assert len(KEYS) <= 72
 
 
 class Recorder:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.runs import SMALL, run_command
+from tests.runs import SMALL, ended, run_command
 from torch_qpmpc.experiment.launch import locked, sub_folder
 
 ROOT = Path(__file__).parents[2]
@@ -44,17 +42,8 @@ def test_a_launcher_runs_the_study(launcher, tmp_path):
     launch = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher])
     overrides = arguments(tmp_path, "seed=1,2", *launch)
     # Ray's workers have a low priority by default and would wait for other tests.
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
-    ended = subprocess.run(
-        [sys.executable, "train.py", *overrides],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
-    assert ended.returncode == 0, ended.stderr
+    variables = {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
+    ended(sys.executable, "train.py", *overrides, **variables)
     summaries = [json.loads(path.read_text()) for path in tmp_path.glob("*/summary.json")]
     assert sorted(summary["seed"] for summary in summaries) == [1, 2]
 

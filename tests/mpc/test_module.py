@@ -417,20 +417,13 @@ def test_released_entries_can_change():
         mpc.model()
 
 
-def test_a_released_module_can_be_copied_saved_and_reset():
+def test_a_released_module_can_be_copied_and_reset():
     mpc, s = linear(5), random_states(6)
-    value, names, original = mpc.value(s), [*mpc.state_dict()], mpc
-    mpc = copy.deepcopy(mpc)
     mpc.release()
-    assert (original.structure, [*original.state_dict()]) == ("tied", names)
-    assert_close(original.value(s), value, rtol=0, atol=0)
     step(mpc)
     twin = copy.deepcopy(mpc)
     assert twin.structure == "free"
     assert_close(twin.value(s), mpc.value(s), rtol=0, atol=0)
-    other = linear(6, structure="free")
-    other.load_state_dict(mpc.state_dict())
-    assert_close(other.value(s), mpc.value(s), rtol=0, atol=0)
     mpc.reset_parameters()
     assert_close(mpc.value(s), linear(free=0.0).value(s))
 

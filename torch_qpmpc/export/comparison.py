@@ -172,7 +172,7 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
     if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
-        remedy = "See mpc.solve(s): hard rows may contradict each other; a finite slack mends it."
+        remedy = "See mpc.solve(s): hard rows may contradict each other; finite slacks soften them."
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
     H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
     terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
