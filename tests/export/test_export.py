@@ -181,6 +181,22 @@ def test_states_are_drawn_about_a_feasible_one(tmp_path):
         assert 0 < agreement.u < 1e-8
 
 
+@pytest.mark.parametrize("ends", [(-0.5, 3e9), (-2e8, 5e7), (-4e16, 0.5), (0.0, 7e11)])
+def test_a_bound_that_cannot_act_draws_the_states_of_none(ends, tmp_path):
+    def bounded(ends: tuple[float, float]) -> QPMPC:
+        options = {"stage_weight": [1.0, 0.1, 0.1], "action_bounds": ([-1.0], [1.0])}
+        sides = {"state_bounds": ([ends[0], -torch.inf], [ends[1], torch.inf])}
+        A, B = [[0.9, 0.2], [0.0, 0.8]], [[0.1], [0.5]]
+        return QPMPC.from_model(A, B, 8, **options, **sides, state_slack=100.0)
+
+    mpc, near = bounded(ends), [x if abs(x) < 1e6 else np.copysign(np.inf, x) for x in ends]
+    sizes = [np.abs(draw(make_tables(x), 50)).max(0) for x in (mpc, bounded((near[0], near[1])))]
+    np.testing.assert_allclose(*sizes, rtol=0.1)
+    export = export_c(mpc, tmp_path)
+    if export.agreement is not None:
+        assert export.agreement.u < 1e-8
+
+
 def test_hard_rows_that_contradict_each_other_are_refused(tmp_path):
     bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
     mpc = QPMPC.from_model([[0.0]], [[0.0]], 2, stage_weight=[1.0, 1.0], offset=[3.0], **bounds)

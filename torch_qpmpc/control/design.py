@@ -147,8 +147,18 @@ class Design:
         weights = np.diag(self.Q)
         costly = weights > 0
         by_weight = np.where(costly, 1 / np.sqrt(np.where(costly, weights, 1.0)), self.scaling.y)
+        return np.where(self.ranged, ranges(self.y_bounds), by_weight)
+
+    @cached_property
+    def ranged(self) -> Array:
+        """Mask of the outputs with two bounds, of which none is too far away to act, ``(n_y,)``."""
         half = ranges(self.y_bounds)
-        return np.where((half > 0) & (half <= self.scaling.y), half, by_weight)
+        return (half > 0) & (half <= self.scaling.y)
+
+    @property
+    def middle(self) -> Array:
+        """The middle of the bounds of the outputs that are `ranged`, else zero, ``(n_y,)``."""
+        return np.where(self.ranged, self.y_bounds, 0.0).mean(0)
 
     @cached_property
     def scaling(self) -> Scaling:
@@ -374,11 +384,6 @@ def read_switching(
 def largest(bounds: tuple[Array, Array] | Array) -> Array:
     """Return the largest size of finite bounds, and zero where there is none."""
     return np.where(np.isfinite(bounds), np.abs(bounds), 0.0).max(0)
-
-
-def middle(bounds: tuple[Array, Array]) -> Array:
-    """Return the middle of the bounds, and zero where there is none."""
-    return np.where(np.isfinite(bounds).all(0), bounds, 0.0).mean(0)
 
 
 def read_prices(

@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.control.design import Design, middle
+from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
 from torch_qpmpc.control.exporting import WEIGHT, undetermined
 from torch_qpmpc.control.law import Law, Memory
@@ -196,7 +196,7 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     half = np.diag(design.scaling.y)
     off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
     off = off.reshape(-1, n_y)
-    rest = mpc.target(r[0] if len(r) else middle(design.y_bounds), known=known)
+    rest = mpc.target(r[0] if len(r) else design.middle, known=known)
     of_y, _, of_x, _ = design.scaling
     x = (off / of_y) @ np.linalg.pinv(design.normal.plant.C).T * of_x
     x = rest.x.numpy() + np.vstack((x, np.zeros((2, len(of_x)))))

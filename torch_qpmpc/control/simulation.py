@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_seed, check_whole
-from torch_qpmpc.control.design import Design, middle
+from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.scaling import FAINT, Scaling
@@ -229,7 +229,7 @@ def ready(law: Law) -> Law:
     memory, rows, y = (
         law.begun(rests=True),
         (law.design.horizon + 1, 1),
-        middle(law.design.y_bounds),
+        law.design.middle,
     )
     known = np.tile(last_known(law.design, memory), rows)
     for r in (y + 100.0 * law.design.usual, y):
@@ -251,9 +251,9 @@ def centre(design: Design, known: Array) -> Array:
     An input with one bound is half its range from it.
     """
     half, (lower, upper) = design.scaling.u, design.u_bounds
-    u, y = np.clip(0.0, lower + half, upper - half), middle(design.y_bounds)
+    u, y = np.clip(0.0, lower + half, upper - half), design.middle
     held = design.plant.C @ design.scaling.at_rest(design.plant, u, known, y, FAINT)
-    return np.where(np.isfinite(design.y_bounds).all(0), y, np.clip(held, *design.y_bounds))
+    return np.where(design.ranged, y, np.clip(held, *design.y_bounds))
 
 
 def at_rest(mpc: LinearMPC, known: Array) -> tuple[Array, Array]:

@@ -30,6 +30,8 @@ SINGULAR = 1e-12
 TINY = 1e-300
 #: Weight of entries without bounds at the centre, relative to those with.
 CENTRED = 1e-6
+#: A bound this many times further away than another one does not act.
+FAR = 1e6
 
 Array = np.ndarray
 
@@ -252,6 +254,7 @@ def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Arra
     C, b, G, lb, ub, w = (getattr(qp, name).detach().double().cpu() for name in names)
     half = (ub - lb) / 2
     rows = half.isfinite() & (half > 0) & (w > 0)
+    rows &= half <= FAR * half[rows].min() if rows.any() else rows
     weighted = G[rows] / half[rows, None].square()
     H = weighted.mT @ G[rows]
     H = H + CENTRED * max(float(H.diagonal().mean()), 1.0) * torch.eye(len(H)).to(H)
