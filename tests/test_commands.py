@@ -32,7 +32,8 @@ DATA = f"{FEW} start.transitions=200 task.start_episodes=2"
 SWEEP = f"{FEW} hydra.launcher.n_jobs=2 hydra.launcher.verbose=0"
 CASE = f"{SWEEP} constraint=fixed noise=gaussian"
 #: A run that is stopped at its first checkpoint.
-LONG = f"python train.py {' '.join(SMALL)} seed=71 updates=200 hydra.run.dir=runs/mine"
+MINE = "seed=71 updates=99 eval_interval=9 hydra.run.dir=runs/mine"
+LONG = f"python train.py {' '.join(SMALL)} {MINE}"
 STOPPED = (
     f"{LONG} & while [ ! -e runs/mine/checkpoint.pt ]; do sleep 0.2; done; kill $!; "
     f"wait $! && exit 1; {LONG}"
