@@ -174,12 +174,9 @@ class AtRest:
     def __init__(self, qp: QuadraticProgram, n_f: int, n_kept: int, solver: str) -> None:
         data = [to_numpy(x.detach()) for x in qp.tensors()]
         self.prepared, self.solver = prepared_for(data, n_kept), solver
-        self._active, programs = (
-            np.zeros((1, qp.lb.shape[-1]), np.int8),
-            self._of(np.zeros((1, n_f))),
-        )
+        self._active = np.zeros((1, qp.lb.shape[-1]), np.int8)
         # The certificate proves nothing without a convex cost.
-        self._is_sound = programs.scaled().solvable() is None
+        self._is_sound = self._of(np.zeros((1, n_f))).scaled().solvable() is None
 
     def solve(self, fixed: np.ndarray, warm: bool = True) -> BatchSolution:
         """Solve and certify the QP with the fixed entries ``(1, n_f)``, in float64.
