@@ -285,7 +285,7 @@ def steps_of(
         *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
         refined,
         _diagnosed,
-        *others,
+        *(step for other in others for step in (other, refined)),
         partial(_refined_last, log, last),
     ]
 
