@@ -39,7 +39,7 @@ BUDGET = {
     "identification": 2430,
     "mpc": 3665,
     "proofs": 1001,
-    "qp": 5937,
+    "qp": 5934,
     "study": 550,
 }
 #: Libraries that only some layers may import.
