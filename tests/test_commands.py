@@ -67,7 +67,7 @@ CANNOT = {
     "python -m tests.benchmarks.solvers --write": "the same, with piqp, osqp, qpax and more",
     "python -m tests.benchmarks.export --write": "the same, with osqp",
     "python -m tests.benchmarks.gpu --write": "it needs a GPU",
-    "python -m tests.benchmarks.daisy FOLDER --write": "its data sets are downloaded by hand",
+    "python -m tests.benchmarks.public_logs FOLDER --write": "its logs are downloaded by hand",
     "python train.py -m +study=paper hydra/launcher=submitit_slurm "
     "hydra.launcher.partition=PARTITION hydra.launcher.timeout_min=60 "
     "hydra.launcher.cpus_per_task=1 hydra.launcher.array_parallelism=40": "it needs Slurm",

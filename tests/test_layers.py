@@ -36,7 +36,7 @@ BUDGET = {
     "experiment": 2985,
     "export": 1458,
     "learning": 2840,  # models that did not train theta decide in improve
-    "identification": 2430,
+    "identification": 2425,
     "mpc": 3665,
     "proofs": 1001,
     "qp": 5934,

@@ -11,7 +11,7 @@ import torch_qpmpc as qm
 from torch_qpmpc.identification import subspace
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.identification.likelihood import Noisy, Signals, groups_of, smooth
+from torch_qpmpc.identification.likelihood import Noisy, Signals, em, groups_of, smooth
 
 
 def tank(rows: int, hold: int, seed: int, start: float = 0.0, noise: float = 0.05) -> dict:
@@ -106,6 +106,15 @@ def test_missing_outputs_cost_only_their_information(kind):
     assert len(found.log.trajectories) == 1
     assert off(found, new) < 1.15 * off(qm.identify(log, order=2), new)
     assert "outputs missing" in str(found)
+
+
+def test_a_likelihood_that_is_no_number_leaves_the_last_model():
+    y, one = np.random.default_rng(0).normal(size=(20, 1)), np.eye(1)
+    start = Noisy(0.5 * one, one, one, one, one, np.zeros(1), one)
+    data = [Signals(y, np.ones((19, 1)))]
+    assert np.isfinite(em(start, data, 3).A).all()
+    broken = start._replace(A=np.full((1, 1), np.nan))
+    assert em(broken, data, 3) is broken
 
 
 def test_smoothed_states_are_the_means_given_the_outputs_that_are_there():

@@ -62,14 +62,14 @@ class Smoothed(NamedTuple):
 def course(A, C, W, N, Q, R, L, P, seen, same):
     """Return the parts of a `Course` for the outputs ``seen`` ``(T, n_y)``; see above.
 
-    L is the gain in directions without variance. A covariance that changes by less than the share
-    ``same`` between complete rows stays.
+    L is the gain in directions without variance. A covariance whose entries change by less than the
+    share ``same`` of the states' variances between complete rows stays.
     """
     T, n_y = seen.shape
     n = len(A)
     Ps, Ks = np.zeros((T, n, n)), np.zeros((T, n, n_y))
     Vs, inverses, half = np.zeros((T, n_y, n_y)), np.zeros((T, n_y, n_y)), np.zeros(T)
-    P, X, Y = P.copy(), np.zeros((n, n)), np.zeros((n, n))
+    P, X, Y, size_x = P.copy(), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
     places = np.zeros(n_y, np.int64)
     settled = False
     for t in range(T):
@@ -79,15 +79,8 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
                 places[m] = i
                 m += 1
         if settled and m == n_y:
-            for i in range(n):
-                for j in range(n):
-                    Ps[t, i, j] = P[i, j]
-                for j in range(n_y):
-                    Ks[t, i, j] = Ks[t - 1, i, j]
-            for i in range(n_y):
-                for j in range(n_y):
-                    Vs[t, i, j], inverses[t, i, j] = Vs[t - 1, i, j], inverses[t - 1, i, j]
-            half[t] = half[t - 1]
+            Ps[t], Ks[t], Vs[t] = P, Ks[t - 1], Vs[t - 1]
+            inverses[t], half[t] = inverses[t - 1], half[t - 1]
             continue
         G, V = np.zeros((n, m)), np.zeros((m, m))
         for i in range(n):
@@ -141,9 +134,7 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
             for b in range(m):
                 Vs[t, places[a], places[b]] = V[a, b]
                 inverses[t, places[a], places[b]] = inverse[a, b]
-        for i in range(n):
-            for j in range(n):
-                Ps[t, i, j] = P[i, j]
+        Ps[t] = P
         for i in range(n):
             for j in range(n):
                 X[i, j] = P[i, j] + W[i, j]
@@ -165,36 +156,51 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
                 for k in range(n):
                     total += Y[i, k] * A[j, k]
                 X[i, j] = total
-        change, largest = 0.0, 0.0
+        settled = m == n_y
+        for i in range(n):
+            size_x[i] = np.sqrt(max(P[i, i] + W[i, i], 0.0))
         for i in range(n):
             for j in range(n):
-                value = (X[i, j] + X[j, i]) / 2
-                change = max(change, abs(value - P[i, j]))
-                largest = max(largest, abs(value))
-                Y[i, j] = value
-        for i in range(n):
-            for j in range(n):
-                P[i, j] = Y[i, j]
-        settled = m == n_y and change <= same * largest
+                Y[i, j] = (X[i, j] + X[j, i]) / 2
+                if abs(Y[i, j] - P[i, j]) > same * size_x[i] * size_x[j]:
+                    settled = False
+        P[:] = Y
     return Ps, Ks, Vs, inverses, half, P
 
 
-def filtered(A: Array, C: Array, run: Course, y: Array, moved: Array, x: Array) -> tuple:
+@compiled
+def filtered(A, C, K, y, moved, x):
     """Return the predictions ``(T, G, n)`` of states and the innovations, zero where missing.
 
     Args:
         A, C: the model.
-        run: the filter's matrices.
+        K: the gains of each step, ``(T, n, n_y)``.
         y: outputs ``(T, G, n_y)``, NaN where they are missing.
         moved: B u + .. of the steps, ``(T - 1, G, n)``.
         x: the first states' mean ``(n,)``.
     """
-    AK = A @ run.K
-    filled = np.where(np.isnan(y), 0.0, y)
-    start = np.broadcast_to(x, (y.shape[1], len(A))).copy()
-    # Copies are contiguous, or the kernels would be compiled for each layout.
-    prior = recursion((A - AK @ C)[:-1].copy(), (moved + applied(AK, filled)[:-1]).copy(), start)
-    return prior, np.where(np.isnan(y), 0.0, y - prior @ C.T)
+    T, G, n_y = y.shape
+    n = len(A)
+    prior, e, z = np.empty((T, G, n)), np.zeros((T, G, n_y)), np.empty(n)
+    for g in range(G):
+        prior[0, g] = x
+    for t in range(T):
+        for g in range(G):
+            for a in range(n_y):
+                if not np.isnan(y[t, g, a]):
+                    e[t, g, a] = y[t, g, a]
+                    for i in range(n):
+                        e[t, g, a] -= C[a, i] * prior[t, g, i]
+            for i in range(n):
+                z[i] = prior[t, g, i]
+                for a in range(n_y):
+                    z[i] += K[t, i, a] * e[t, g, a]
+            for i in range(n if t + 1 < T else 0):
+                total = moved[t, g, i]
+                for j in range(n):
+                    total += A[i, j] * z[j]
+                prior[t + 1, g, i] = total
+    return prior, e
 
 
 def smoothed(A: Array, C: Array, run: Course, prior: Array, e: Array) -> Smoothed:
@@ -232,9 +238,7 @@ def recursion(M, c, z):
     """Return z_0 = z and z_{t+1} = M_t z_t + c_t, ``(T + 1, G, n)``."""
     T, G, n = c.shape
     out = np.empty((T + 1, G, n))
-    for i in range(G):
-        for j in range(n):
-            out[0, i, j] = z[i, j]
+    out[0] = z
     for t in range(T):
         for i in range(G):
             for j in range(n):
@@ -250,9 +254,7 @@ def spread(J, own, last):
     """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, n, n)``."""
     T, n, _ = own.shape
     out, half = np.empty((T + 1, n, n)), np.empty((n, n))
-    for j in range(n):
-        for k in range(n):
-            out[T, j, k] = last[j, k]
+    out[T] = last
     for t in range(T - 1, -1, -1):
         for j in range(n):
             for k in range(n):

@@ -73,8 +73,7 @@ class Identified:
 
         They are NaN in the first steps of each trajectory, too, in which the filter settles.
         """
-        order, lags = self.fit.order, self.fit.lags
-        errors = held_out_errors(self.log.trajectories, order, lags, self.horizon)
+        errors = held_out_errors(self.log.trajectories, self.fit.parts, self.horizon)
         return torch.as_tensor(errors)
 
     @property
@@ -205,7 +204,7 @@ def measured_model(
     """Fit the model whose states are the outputs, and return it with the log; see `identify`."""
     log = as_log(trajectories, n_x, n_d)
     check_excitation(log)
-    return fit_state_space(log.trajectories, 0).model, log
+    return fit_state_space(log.trajectories, 0, 0).model, log
 
 
 def model_arguments(model: Innovations) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from torch_qpmpc.identification.filter import Array, Course, alike, applied, cou
 
 #: A gain that differs from the steady one by less than this share has settled.
 SETTLED = 1e-9
+#: A covariance whose entries change by less than this share of the states' variances stays.
+STAYS = 1e-14
 
 
 class Innovations(NamedTuple):
@@ -62,7 +64,7 @@ class Innovations(NamedTuple):
         none, N = np.zeros_like(A), L @ S
         P = self.P0 if P is None else P
         parts = (A, C, N @ L.T, N, none, S, L, P)
-        return Course(*course(*map(np.ascontiguousarray, (*parts, seen)), 0.0))
+        return Course(*course(*map(np.ascontiguousarray, (*parts, seen)), STAYS))
 
     def settling(self, steps: int, settled: float = SETTLED) -> tuple[Array, Array]:
         """Return the gains L_0, L_1, .. from P0 and their outputs' covariances, at most ``steps``.
@@ -92,8 +94,9 @@ class Innovations(NamedTuple):
         seen, xi = ~np.isnan(y), np.empty((*y.shape[:2], n))
         for rows in alike(seen):
             run = self.course(seen[rows[0]])
-            outputs, moved = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
-            prior, e = filtered(self.A, self.C, run, outputs, moved, self.x0)
+            signals = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
+            parts = map(np.ascontiguousarray, (self.A, self.C, run.K, *signals, self.x0))
+            prior, e = filtered(*parts)
             xi[rows] = np.moveaxis(prior + applied(run.K, e), 0, 1)
         return xi.reshape(*batch, -1, n)
 

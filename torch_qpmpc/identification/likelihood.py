@@ -89,20 +89,23 @@ def smooth(par: Noisy, group: Group) -> Smoothed:
     none, zero = np.zeros_like(A), np.zeros_like(C.T)
     parts = map(np.ascontiguousarray, (A, C, none, zero, Q, R, zero, P))
     run = Course(*course(*parts, group.kinds[group.kind], SAME))
-    y, moved = np.moveaxis(group.y, 0, 1), np.moveaxis(group.v @ B.T, 0, 1)
-    return smoothed(A, C, run, *filtered(A, C, run, y, moved, m))
+    signals = (np.moveaxis(x, 0, 1) for x in (group.y, group.v @ B.T))
+    prior, e = filtered(*map(np.ascontiguousarray, (A, C, run.K, *signals, m)))
+    return smoothed(A, C, run, prior, e)
 
 
 def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
     """Raise the likelihood by expectation maximisation."""
-    groups, before = groups_of(data), -np.inf
+    groups, before, last = groups_of(data), -np.inf, par
     steps = sum(len(y) for y, _ in data)
     for _ in range(iterations):
         moments = [smooth(par, group) for group in groups]
         value = sum(m.likelihood for m in moments) / steps
-        if not value - before >= STALLED:  # or it is NaN
+        if not np.isfinite(value):
+            return last
+        if value - before < STALLED:
             break
-        before, par = value, _maximise(groups, moments)
+        before, last, par = value, par, _maximise(groups, moments)
     return par
 
 

@@ -1,9 +1,9 @@
 """Identification of a state-space model with its noise: a subspace start and maximum likelihood.
 
-The start is PBSID (Chiuso 2007): an ARX model with p lags, by ridge regression, predicts the
-outputs; the singular vectors of its predictions of the next p outputs are the states, and least
-squares give their model. Expectation maximisation (Shumway and Stoffer 1982) then raises the
-likelihood of
+The start is an ARX model with p lags, by ridge regression, and its reduction: the singular vectors
+of its predictions over twenty steps are the states, whose model is that of least squares (PBSID,
+Chiuso 2007, takes predictions of one step). Expectation maximisation (Shumway and Stoffer 1982)
+then raises the likelihood of
 
     x_{k+1} = A x_k + B u_k + E d_k + offset + w_k,   y_k = C x_k + v_k,   cov w = Q, cov v = R,
 
@@ -27,8 +27,6 @@ from torch_qpmpc.identification.likelihood import (
     Signals,
     batches,
     em,
-    groups_of,
-    smooth,
     starting,
     steady,
 )
@@ -41,15 +39,14 @@ FEW, MANY = 5, 20
 #: states of their own.
 HIDDEN = 1e-2
 #: Candidates, as far as the data allow; 0 states are the outputs alone.
-ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20), (2, 5, 10, 20)
+ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20), (5, 10, 20, 40)
 #: Cross-validation leaves out every PARTS-th block of a log. Longer trajectories are cut into
 #: blocks of LONG steps, or fewer so that there are BLOCKS, but no shorter than SHORT.
 PARTS, BLOCKS, LONG, SHORT = 4, 12, 200, 10
 #: Steps of the predictions that decide.
 HORIZONS = (1, 2, 5, 10, 20)
-#: Gaps of so many rows are filled for the starts of the fits, so many times by a model of so many
-#: states at most.
-FILLED, REFILLED, SMOOTHING = 20, 2, 6
+#: Gaps of so many rows are filled for the starts of the fits.
+FILLED = 20
 #: First steps of a trajectory in which its filter settles, at most a quarter: they decide nothing.
 SETTLING = 20
 #: Squared errors that differ by less than the share MARGIN, in the geometric mean, are equal, and
@@ -61,8 +58,9 @@ WORST = 1e6
 #: Outputs may be unmoved if they are constant in this share of the steps; the number of past inputs
 #: in the test, and its level.
 CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
-#: So many orders in turn that are no better end the search.
-PATIENCE = 3
+#: So many orders, whose starts have the least errors, are compared by their likeliest models, and
+#: more if the rows of these are no more than ROWS.
+REFINED, ROWS = 2, 10_000
 #: Autocorrelations of the residuals in the test of whiteness.
 CORRELATIONS = 20
 
@@ -86,12 +84,14 @@ class Fit(NamedTuple):
         model: the model.
         order, lags: as in `fit_state_space`.
         candidates: those that were compared.
+        parts: models that have not seen the outputs of a part of the log each.
     """
 
     model: Innovations
     order: int
     lags: int
     candidates: tuple[Candidate, ...] = ()
+    parts: tuple[Innovations, ...] = ()
 
 
 def fit_state_space(
@@ -107,41 +107,40 @@ def fit_state_space(
         trajectories: the log.
         order: states of the likelihood's model; 0 for the outputs alone, each measured exactly.
             The innovations form has more if the outputs are not independent functions of them.
-        lags: lags of the ARX model of the start.
+        lags: lags of the ARX model of the start; with an ``order`` only.
     """
     normal = _Normal(trajectories)
-    data, rows = normal.apply(trajectories), ()
-    filled = _filled(data)
-    if order is None or (lags is None and order):
-        orders = ORDERS if order is None else (order,)
-        held = _Held(trajectories)
-        rows = tuple(_compare(data, filled, held, orders, lags, order is None))
+    data = normal.apply(trajectories)
+    filled, rows, parts = _filled(data), [], []
+    if lags is None:
+        found = _compare(data, filled, trajectories, ORDERS if order is None else (order,))
+        rows = [row for row, _ in found]
         best = min(equal_candidates(rows), key=lambda row: (row.order, row.score))
         order, lags = best.order, best.lags
+        parts = [readable(x, data) if order else x for x in found[rows.index(best)][1]]
+    model = measured(data, filled)
     if order:
-        par = em(_states(_predictor(filled, lags or 0), order), data, MANY)
+        par = em(_states(_predictor(filled, lags), order), data, MANY)
         model = readable(steady(par), data)
-    else:
-        model = measured(data, filled)
-    return Fit(normal.restore(model), order, lags or 0, rows)
+    return Fit(
+        normal.restore(model), order or 0, lags, tuple(rows), tuple(map(normal.restore, parts))
+    )
 
 
 def held_out_errors(
-    trajectories: Sequence[Trajectory], order: int, lags: int, horizon: int
+    trajectories: Sequence[Trajectory], parts: Sequence[Innovations], horizon: int
 ) -> Array:
-    """Return multi-step errors ``(steps, horizon, n_y)`` of fits that have not seen their outputs.
+    """Return errors ``(steps, horizon, n_y)`` of models that have not seen a part's outputs each.
 
     The filter knows the outputs before. Errors of the steps in which it settles are NaN.
     """
-    held, total = _Held(trajectories), []
-    for one in trajectories:
-        total.append(np.full((one.steps, horizon, one.y.shape[1]), np.nan))
-    for part in range(PARTS):
-        model = fit_state_space(held.without(part, trajectories), order, lags).model
-        for i, e in enumerate(_errors(model, trajectories, horizon)):
-            mask = held.scored(i, part, horizon)
-            total[i][mask] = e[mask]
-    return np.concatenate(total)
+    block = _Held(trajectories).targets(range(1, horizon + 1))
+    block = np.delete(block, np.cumsum([one.steps + 1 for one in trajectories]) - 1, 0)
+    total = np.full((*block.shape, trajectories[0].y.shape[1]), np.nan)
+    for part, model in enumerate(parts):
+        mask = (block >= 0) & (block % PARTS == part)
+        total[mask] = np.concatenate(_errors(model, trajectories, horizon))[mask]
+    return total
 
 
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
@@ -178,12 +177,8 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
-    states = []
-    for _, y, v in batches(_signals(trajectories)):
-        u, d = np.split(v, [model.B.shape[1]], -1)
-        x = model.estimates(y, u, d)[..., :-1, :] @ model.A.T + model.inputs(u, d)
-        states.append(x.reshape(-1, len(model.A)))
-    x = np.concatenate(states)
+    pairs = zip(*_filtered(model, _signals(trajectories)), strict=True)
+    x = np.concatenate([(x @ model.A.T + moved)[:-1] for x, moved in pairs])
     return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
 
 
@@ -226,28 +221,15 @@ class _Held:
         pairs = [(one, mask) for one, mask in zip(data, masks, strict=True) if not mask.all()]
         return [one._replace(y=np.where(mask[:, None], np.nan, one.y)) for one, mask in pairs]
 
-    def without(self, part: int, trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-        """Return the trajectories without the outputs of the part's blocks."""
-        kept = []
-        for one, rows in zip(trajectories, self.rows, strict=True):
-            out = torch.as_tensor(rows % PARTS == part)
-            if not out.all():
-                kept.append(one._replace(y=one.y.masked_fill(out[:, None], torch.nan)))
-        return kept
-
-    def targets(self, i: int, horizon: int) -> Array:
-        """Return the blocks of the targets of trajectory i, ``(T, horizon)``, -1 for none."""
-        rows = self.rows[i]
-        T = len(rows) - 1
-        target = np.arange(T)[:, None] + np.arange(1, horizon + 1)
-        block = np.where(target <= T, rows[np.minimum(target, T)], -1)
-        block[: min(SETTLING, T // 4)] = -1
-        return block
-
-    def scored(self, i: int, part: int, horizon: int) -> Array:
-        """Return True for the targets of trajectory i in the blocks of a part."""
-        block = self.targets(i, horizon)
-        return (block >= 0) & (block % PARTS == part)
+    def targets(self, steps: Sequence[int]) -> Array:
+        """Return the blocks of the targets so many steps after each row, -1 for none."""
+        found = []
+        for rows in self.rows:
+            T = len(rows) - 1
+            target = np.arange(T + 1)[:, None] + np.array(steps)
+            found.append(np.where(target <= T, rows[np.minimum(target, T)], -1))
+            found[-1][: min(SETTLING, T // 4)] = -1
+        return np.concatenate(found)
 
 
 def _feasible(starts: Sequence[Sequence[Signals]]) -> tuple[int, ...]:
@@ -264,65 +246,87 @@ def _feasible(starts: Sequence[Sequence[Signals]]) -> tuple[int, ...]:
 def _compare(
     data: Sequence[Signals],
     filled: Sequence[Signals],
-    held: _Held,
+    trajectories: Sequence[Trajectory],
     orders: Sequence[int],
-    lags: int | None,
-    alone: bool,
-) -> list[Candidate]:
-    """Return the candidates with their scores; ``alone`` are the outputs without a filter, too."""
+) -> list[tuple[Candidate, list[Innovations]]]:
+    """Return the candidates and their models, each fitted without a part of the log.
+
+    The starts of all orders and lags are compared, and the likeliest models of the best of them.
+    """
+    held = _Held(trajectories)
+    block = held.targets(HORIZONS)
     folds, bases = ([held.out(part, x) for part in range(PARTS)] for x in (data, filled))
-    found, sums = [], []
 
-    def add(n: int, p: int, models: Sequence[Innovations]) -> float:
-        found.append((n, p))
-        sums.append(_sums(models, data, held))
-        return _score(*(x.sum(0) for x in sums[-1]))
+    def judged(found: dict[tuple[int, int], list[Innovations]]) -> list[Candidate]:
+        sums = [_sums(models, data, held.count, block) for models in found.values()]
+        scores = np.array([_score(*parts.sum(1)) for parts in sums])
+        used = np.flatnonzero(sums[0][1].any((1, 2)))
+        # The jackknife over the blocks gives the errors of the scores' distances.
+        left = np.array([[_score(*(x.sum(1) - x[:, b])) for b in used] for x in sums])
+        errors = np.sqrt((len(used) - 1) * (left - left[scores.argmin()]).var(1))
+        return [*map(Candidate, *zip(*found, strict=True), scores.tolist(), errors.tolist())]
 
-    feasible = _feasible([_runs(base) for base in bases]) if lags is None else (lags,)
-    if alone or not feasible:
-        exact = add(0, 0, [*map(measured, folds, bases)])
-        if exact <= np.log(EXACT) + MARGIN:
-            return [Candidate(0, 0, exact)]
-    for p in feasible:
-        starts = [_predictor(base, p) for base in bases]
-        best, misses = np.inf, 0
-        for n in orders:
-            if n <= min(len(start.s) for start in starts) and misses < PATIENCE:
-                pairs = zip(starts, folds, strict=True)
-                score = add(n, p, [steady(em(_states(one, n), fold, FEW)) for one, fold in pairs])
-                misses = 0 if score < best - MARGIN else misses + 1
-                best = min(best, score)
-    # The jackknife over the blocks gives the errors of the scores' distances.
-    scores = np.array([_score(*(x.sum(0) for x in parts)) for parts in sums])
-    used = np.flatnonzero(sums[0][1].any((1, 2)))
-    left = np.array([[_score(*(x.sum(0) - x[b] for x in parts)) for b in used] for parts in sums])
-    apart = left - left[scores.argmin()]
-    errors = np.sqrt((len(used) - 1) * apart.var(1))
-    return [Candidate(*x) for x in zip(*zip(*found, strict=True), scores, errors, strict=True)]
+    found = {(0, 0): [*map(measured, folds, bases)]}
+    pars, feasible = {}, _feasible([_runs(base) for base in bases])
+    if len(orders) == 1 or judged(found)[0].score > np.log(EXACT) + MARGIN:
+        for p in feasible if any(orders) else ():
+            starts = [_predictor(base, p) for base in bases]
+            for n in orders:
+                if 0 < n <= min(len(start.s) for start in starts):
+                    pars[n, p] = [_states(start, n) for start in starts]
+    if pars:
+        rows = judged({key: [*map(steady, x)] for key, x in pars.items()})
+        best = {row.order: row for row in sorted(rows, key=lambda row: -row.score)}
+        few = sorted(best.values(), key=lambda row: row.score)
+        few = few[: max(REFINED, ROWS // sum(one.steps for one in trajectories))]
+        few.append(min(equal_candidates(rows), key=lambda row: (row.order, row.score)))
+        found = found if len(orders) > 1 else {}
+        for key in dict.fromkeys(row[:2] for row in few):
+            pairs = zip(pars[key], folds, strict=True)
+            found[key] = [steady(em(par, fold, FEW)) for par, fold in pairs]
+    return list(zip(judged(found), found.values(), strict=True))
 
 
-def _sums(models: Sequence[Innovations], data: Sequence[Signals], held: _Held) -> tuple:
-    """Return the squared errors of the blocks ``(blocks, horizons, n_y)`` and their number."""
-    last, chosen, n_y = max(HORIZONS), np.array(HORIZONS) - 1, data[0].y.shape[1]
-    total, count = np.zeros((2, held.count + 1, len(HORIZONS), n_y))
+def _sums(
+    models: Sequence[Innovations], data: Sequence[Signals], count: int, block: Array
+) -> Array:
+    """Return the squared errors of the blocks and their number ``(2, count, horizons, n_y)``."""
+    y = np.concatenate([one.y for one in data])
+    sums = np.zeros((2, count, len(HORIZONS), y.shape[1]))
     for part, model in enumerate(models):
-        for places, y, v in batches(data):
-            many = model.errors(y, v, v[..., :0], last)[..., chosen, :]
-            for i, e in zip(places, many, strict=True):
-                block = held.targets(i, last)[:, chosen]
-                block = np.where(block % PARTS == part, block, -1)
-                for h, steps in enumerate(HORIZONS):
-                    seen = np.isfinite(data[i].y[np.minimum(np.arange(len(e)) + steps, len(e))])
-                    off = np.where(np.abs(e[:, h]) < WORST, e[:, h], WORST)
-                    np.add.at(total[:, h], block[:, h], np.where(seen, off, 0.0) ** 2)
-                    np.add.at(count[:, h], block[:, h], seen)
-    return total[:-1], count[:-1]
+        mine = (block >= 0) & (block % PARTS == part)
+        k = np.flatnonzero(mine.any(1))
+        x, moved = (np.concatenate(many) for many in _filtered(model, data))
+        x = x[k]
+        for step in range(1, max(HORIZONS) + 1):
+            x = x @ model.A.T + moved[np.minimum(k + step - 1, len(y) - 1)]
+            if step in HORIZONS:
+                h = HORIZONS.index(step)
+                rows = mine[k, h]
+                after, where = y[k[rows] + step], block[k[rows], h]
+                e, seen = after - x[rows] @ model.C.T, np.isfinite(after)
+                off = np.where(np.abs(e) < WORST, e, WORST) ** 2 * seen  # NaN is WORST
+                for total, weights in zip(sums, (off, seen), strict=True):
+                    for j, column in enumerate(weights.T):
+                        total[:, h, j] += np.bincount(where, column, count)
+    return sums
+
+
+def _filtered(model: Innovations, data: Sequence[Signals]) -> tuple[list[Array], list[Array]]:
+    """Return the estimates and the effects of the inputs ``(T + 1, n)`` of each trajectory."""
+    estimates, moved = ([np.empty(0)] * len(data) for _ in range(2))
+    for places, y, v in batches(data):
+        known = np.split(v, [model.B.shape[1]], -1)
+        effects = np.pad(model.inputs(*known), ((0, 0), (0, 1), (0, 0)))
+        for i, *own in zip(places, model.estimates(y, *known), effects, strict=True):
+            estimates[i], moved[i] = own
+    return estimates, moved
 
 
 def _score(total: Array, count: Array) -> float:
-    """Return the mean logarithm of the mean squared errors of all horizons and outputs."""
-    seen = count > 0
-    return float(np.log(np.maximum(total[seen] / count[seen], EXACT)).mean())
+    """Return the mean logarithm of the outputs' mean squared errors of all horizons."""
+    mse = (total / np.maximum(count, 1)).sum(0) / np.maximum((count > 0).sum(0), 1)
+    return float(np.log(np.maximum(mse[count.any(0)], EXACT)).mean())
 
 
 def equal_candidates(rows: Sequence[Candidate]) -> list[Candidate]:
@@ -460,11 +464,8 @@ def _runs(data: Sequence[Signals]) -> list[Signals]:
 
 
 def _filled(data: Sequence[Signals]) -> list[Signals]:
-    """Return the trajectories with gaps of outputs up to FILLED rows filled, for the starts.
-
-    They are filled along lines, and again by the smoothed outputs of a model that starts from that.
-    """
-    filled, gaps = [], []
+    """Return the trajectories with gaps of outputs up to FILLED rows filled along lines."""
+    filled = []
     for y, v in data:
         rows, whole = np.arange(len(y)), y.copy()
         for i, column in enumerate(y.T):
@@ -475,18 +476,6 @@ def _filled(data: Sequence[Signals]) -> list[Signals]:
                 near = between & (seen[after] - seen[after - 1] <= FILLED + 1)
                 whole[near, i] = np.interp(rows[near], seen, column[seen])
         filled.append(Signals(whole, v))
-        gaps.append(np.isnan(y) & np.isfinite(whole))
-    if not any(gap.any() for gap in gaps):
-        return filled
-    for _ in range(REFILLED):
-        if not (lags := _feasible([_runs(filled)])):
-            break
-        start = _predictor(filled, lags[-1])
-        par = em(_states(start, min(len(start.s), SMOOTHING)), data, FEW)
-        for group in groups_of(data):
-            smooth_y = smooth(par, group).x @ par.C.T
-            for place, y in zip(group.places, smooth_y, strict=True):
-                filled[place].y[gaps[place]] = y[gaps[place]]
     return filled
 
 
@@ -521,7 +510,7 @@ class _Predictor(NamedTuple):
 
 
 def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
-    """Fit an ARX model of ``lags`` and decompose its predictions of as many steps."""
+    """Fit an ARX model of ``lags`` and decompose its predictions over the HORIZONS."""
     n_y = data[0].y.shape[1]
     windows, after = [], []
     for y, v in _runs(data):
@@ -532,9 +521,12 @@ def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
             after.append(Signals(y[lags:], v[lags:]))
     Z, F = np.concatenate(windows), np.concatenate([y for y, _ in after])
     W = ridge(torch.as_tensor(np.hstack((Z, np.ones((len(Z), 1))))), torch.as_tensor(F)).numpy()
-    G, q = np.zeros((lags * n_y, Z.shape[1])), Z.shape[1] // lags
-    for f in range(lags):
-        G[f * n_y : (f + 1) * n_y, f * q :] = W[: (lags - f) * q].T
+    q = Z.shape[1] // lags
+    step, rows = np.eye(len(W) - 1, k=q), [W[:-1].T]
+    step[-q : n_y - q or None] = W[:-1].T
+    for _ in range(max(HORIZONS) - 1):
+        rows.append(rows[-1] @ step)
+    G = np.concatenate(rows)
     first = np.mean([y[0] for y, _ in _runs(data)], 0)
     _, s, Vh = np.linalg.svd(np.linalg.qr(Z, mode="r") @ G.T, full_matrices=False)
     s = s[s > 1e-9 * s[0]] / np.sqrt(len(Z))
@@ -548,8 +540,7 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
     X, F = [z @ T.T for z in windows], np.concatenate([y for y, _ in after])
     V = np.concatenate([np.hstack((x[:-1], v)) for x, (_, v) in zip(X, after, strict=True)])
     X1, X0 = np.concatenate([x[1:] for x in X]), np.concatenate(X)
-    AB = np.linalg.lstsq(V, X1, rcond=None)[0].T
-    C = np.linalg.lstsq(X0, F, rcond=None)[0].T
+    AB, C = (np.linalg.lstsq(x.T @ x, x.T @ z)[0].T for x, z in ((V, X1), (X0, F)))
     w, r = X1 - V @ AB.T, F - X0 @ C.T
     Q = w.T @ w / len(w) + 1e-6 * np.eye(order)
     R = r.T @ r / len(r) + 1e-9 * np.eye(len(C))
