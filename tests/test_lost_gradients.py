@@ -43,12 +43,12 @@ def linear(**options: Any) -> qm.LinearMPC:
 
 @functools.cache
 def target() -> Any:
-    return linear().target(r=[0.3, 0.0], known=[0.2])
+    return linear().target(r=[0.3, 0.0], known=[[0.2]] * 6)
 
 
 def arranged(**changes: Any) -> Tensor:
     known = torch.linspace(0, 1, 6).unsqueeze(-1)
-    signals = {"x": [1.0, 0.5], "u_last": [0.1], "known": known, "level": [0.2]} | changes
+    signals = {"x": [1.0, 0.5], "u_last": [0.1], "known": known} | changes
     return linear().plan.value(linear().arrange(target=target(), **signals))
 
 
@@ -76,13 +76,13 @@ DIFFERENTIATED: dict[str, tuple[Callable[[Tensor], Tensor], Any]] = {
     "arrange x": (lambda t: arranged(x=t), [1.0, 0.5]),
     "arrange u_last": (lambda t: arranged(u_last=t), [0.1]),
     "arrange known": (lambda t: arranged(known=t), [[0.1]] * 6),
-    "arrange level": (lambda t: arranged(level=t), [0.2]),
     "arrange target": (
         lambda t: linear().plan.value(linear().arrange([1.0, 0.5], target()._replace(x=t))),
         [0.3, 0.0],
     ),
     "DeviationPenalty C": (lambda t: qm.DeviationPenalty(scheme())(t), scheme().C_0 + 0.1),
     "target r": (lambda t: linear().target(t).y, [0.3, 0.0]),
+    "target known": (lambda t: linear().target([0.3, 0.0], known=t).u, [0.2]),
     "nearest_psd H": (nearest_psd, [[1.0, 2.0], [2.0, 1.0]]),
     "spectral_radius A": (lambda t: spectral_radius(t, *GAIN), A),
     "second_moment s": (lambda t: second_moment(t, S[:, :1]), S + 0.1),

@@ -17,7 +17,7 @@ from torch_qpmpc.errors import QPError
 #: Where a wheel has its copies of train.py and configs/; in a clone they are beside the package.
 PACKAGED = Path(__file__).with_name("command")
 #: The version of the format that `save_file` writes, and the newest that `load_file` reads.
-VERSION = 1
+VERSION = 2
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:

@@ -195,11 +195,11 @@ def test_a_step_is_that_of_the_differentiable_parts(seed, references):
         observer, e = controller.observer, controller._memory.e
         assert e is not None
         e = np.linalg.solve(observer.F, e - observer.predicted(np.zeros_like(e), u, d[0]))
-        target = mpc.target(r if references == "preview" else r[0], e[3:], d.mean(0))
-        p = mpc.arrange(e[:3], target, u_last=u_last, known=d, level=d.mean(0))
+        stages = (r + np.zeros((9, 1)), d) if mpc.design.staged else (r[-1], d[-1])
+        target = mpc.target(stages[0], e[3:], stages[1])
+        p = mpc.arrange(e[:3], target, u_last=u_last, known=d)
         plan = mpc.plan.solve(p, warm_start=mpc.plan.solve(p))
-        last = target.u[-1] if references == "preview" else target.u
-        expected = last + plan.z[mpc.plan.n_p :][:2]
+        expected = target.u.reshape(-1, 2)[-1] + plan.z[mpc.plan.n_p :][:2]
         assert controller.status == 0
         assert np.abs(u - expected.clamp(-0.5, 0.5).numpy()).max() < 1e-7
         active += int(plan.active.any())

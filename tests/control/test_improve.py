@@ -24,7 +24,7 @@ CASES = {
     "prices": {"linear": {"q": "price"}, "dR": 0.5, "du_bounds": (-2.0, 2.0)},
     "limits": {"y_bounds": {"T": (None, "top")}, "dR": 0.5},
     "preview": {"references": "preview", "R": 0.1, "y_bounds": (19.0, 21.0)},
-    "blocks": {"blocks": [1, 2, 2], "dR": 0.5, "disturbances": None},
+    "blocks": {"blocks": [1, 2, 2], "dR": 0.5, "disturbances": None, "u_bounds": (0.0, 40.0)},
 }
 
 
@@ -104,6 +104,8 @@ def test_its_loops_are_the_controllers_own(case):
             _, e, y, *_ = plant._parts(base)
             a = controller.mpc.plan.policy(p)
             u, costs = u_s + a, plant.cost(s, a)
+            place = law.design.places["u_r"]
+            u_s = u_s + p[:, place] if place.stop else u_s  # of the first stage
             ahead = plant._ahead(base, 5).numpy()
             for i in range(3):
                 begun = law.begun(u_last[i].numpy())

@@ -33,11 +33,12 @@ DESIGN = {
 SCALAR = ([[0.9]], [[0.5]])
 
 
-def reference(x, target, r, known, u_last, held=(), N=8):
-    """Solve the problem as its docstring has it, about the steady state for the last set-point."""
+def reference(x, targets, known, u_last, held=(), N=8):
+    """Solve the problem as its docstring has it, with the steady state of each stage's signals."""
     plan = cvxpy.Variable((N, 2))
     rows: list[cvxpy.Constraint] = [plan >= -1, plan <= 1]
     rows += [plan[k] == plan[k - 1] for k in held]
+    target = targets[-1]
     cost, last, load = 0, u_last, target.y - C @ target.x
     for k in range(N + 1):
         y = C @ x + load
@@ -51,9 +52,8 @@ def reference(x, target, r, known, u_last, held=(), N=8):
             assert plan.value is not None
             return plan.value[0]
         du = plan[k] - last
-        u_s = target.u + np.linalg.solve(C @ np.linalg.solve(np.eye(3) - A, B), r[k] - r[-1])
-        cost += 2 * cvxpy.square(y[0] - r[k][0]) + cvxpy.square(y[1] - r[k][1])
-        cost += 0.3 * cvxpy.square(plan[k, 0] - u_s[0])
+        cost += 2 * cvxpy.square(y[0] - targets[k].y[0]) + cvxpy.square(y[1] - targets[k].y[1])
+        cost += 0.3 * cvxpy.square(plan[k, 0] - targets[k].u[0])
         cost += 0.5 * cvxpy.square(du[0]) + 0.2 * cvxpy.square(du[1])
         cost += known[k][1] * plan[k, 0] + 0.05 * plan[k, 1]
         rows += [cvxpy.abs(du[1]) <= 0.3]
@@ -94,14 +94,12 @@ def test_the_plan_is_that_of_the_problem_in_the_docstring(references, blocks, he
         r = 0.1 * rng.normal(size=(9, 2))
         r = r if references == "preview" else r[:1].repeat(9, 0)
         known = 0.1 * rng.normal(size=(9, 2))
-        d = known.mean(0)
-        expected = steady_state(r[-1], w, d)
-        target = mpc.target(r if references == "preview" else r[0], w, d)
-        last = target.u[-1] if references == "preview" else target.u
-        assert np.allclose(last, expected.u, atol=1e-8)
-        u = reference(x, expected, r, known, u_last, held)
-        p = mpc.arrange(x, target, known=known, level=d, u_last=u_last)
-        assert np.allclose(last + mpc.plan.policy(p).detach(), u, atol=1e-5)
+        expected = [steady_state(r[k], w, known[k]) for k in range(9)]
+        target = mpc.target(r, w, known)
+        assert np.allclose(target.u, [one.u for one in expected], atol=1e-8)
+        u = reference(x, expected, known, u_last, held)
+        p = mpc.arrange(x, target, known=known, u_last=u_last)
+        assert np.allclose(target.u[-1] + mpc.plan.policy(p).detach(), u, atol=1e-5)
 
 
 def test_an_input_weight_moves_no_output_off_a_set_point_that_can_be_reached():
@@ -139,8 +137,9 @@ def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
 def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
     # The position has no weight and does not decay.
     mpc = qm.LinearMPC(([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]]), 3, Q=[0.0, 1.0], R=1.0)
-    assert torch.equal(mpc.plan.H_f.detach()[:2, :2], torch.diag(torch.tensor([0.0, 2.0])).double())
-    assert mpc.plan.H_f.detach()[2:].abs().max() == 0
+    squares = torch.zeros(4, 4).double()
+    squares[[1, 1, 2, 2], [1, 2, 1, 2]] = 2.0  # of the speed's deviation and of y_s - r
+    assert torch.equal(mpc.plan.H_f.detach()[:4, :4], squares)
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
@@ -179,7 +178,7 @@ def test_p_takes_batches_and_is_relative_to_the_last_target():
     p = mpc.arrange(np.ones((5, 3)), mpc.target(r), known=np.ones((5, 9, 2)))
     assert tuple(p.shape) == (5, mpc.plan.n_p)
     assert np.allclose(p[0, :2], -0.1)  # r_0 - r_N
-    assert p[0, 4:6].tolist() == [1, 1]
+    assert p[0, 4:6].tolist() == [0, 1], "a load is relative to its last row"
     assert p[0, 48 : 48 + 4].abs().max() < 1e-12
 
 
@@ -218,7 +217,7 @@ def test_bad_arguments_are_named(arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"z": 1.0}, "signals: got 'z', expected some of u_last, known, level"),
+        ({"z": 1.0}, "signals: got 'z', expected some of u_last, known"),
         ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected 1 entries"),
         ({"known": np.ones((3, 2))}, "known: .* expected 0 entries"),
     ],
@@ -230,7 +229,7 @@ def test_signals_that_are_not_those_of_p_are_named(arguments, message):
 
 
 def test_set_points_of_another_size_are_named():
-    with pytest.raises(QPError, match=r"^r: got shape \(2,\), expected \(\*batch, 1\)"):
+    with pytest.raises(QPError, match=r"^r: got shape \(2,\), expected 1 entries"):
         qm.LinearMPC(SCALAR, 3, Q=1.0).target([1.0, 2.0])
 
 

@@ -55,10 +55,8 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     twin = qm.LinearMPC.load(tmp_path / "mpc.qpmpc")
     plain = qm.QPMPC.load(tmp_path / "mpc.qpmpc")
     known = np.ones((5, 2))
-    p = twin.arrange([0.3, 0.1], twin.target([0.5], w=[0.1]), known=known, level=[1.0, 1.0])
-    assert torch.equal(
-        p, mpc.arrange([0.3, 0.1], mpc.target([0.5], w=[0.1]), known=known, level=[1.0, 1.0])
-    )
+    p, own = (x.arrange([0.3, 0.1], x.target([0.5], w=[0.1]), known=known) for x in (twin, mpc))
+    assert torch.equal(p, own)
     assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
     assert torch.equal(plain.policy(p), mpc.plan.policy(p))
     twin.plan.reset_parameters()
@@ -74,15 +72,25 @@ def test_arguments_are_those_of_its_qp():
     assert torch.equal(plain.policy(p), mpc.plan.policy(p))
 
 
-def test_later_releases_read_the_first_format():
+def test_files_of_the_first_format_are_read_but_for_theta_of_another_cost(tmp_path):
+    with pytest.raises(QPError, match=r"^path: got .*learned another cost, expected .* version 2"):
+        qm.Controller.load(FOLDER / "saved-1.qpmpc")
+    controller = qm.Controller(qm.LinearMPC((A, B, C), 5, Q=1.0, dR=1.0, u_bounds=(-1.0, 1.0)))
+    controller.save(tmp_path / "plain")
+    torch.save({**torch.load(tmp_path / "plain"), "version": 1}, tmp_path / "plain")
+    twin = qm.Controller.load(tmp_path / "plain")
+    assert twin.step([1.0], [0.0]) == controller.step([1.0], [0.0])
+
+
+def test_later_releases_read_the_format():
     """``python -m tests.control.test_saving`` has written the file."""
-    controller = qm.Controller.load(FOLDER / "saved-1.qpmpc")
+    controller = qm.Controller.load(FOLDER / "saved-2.qpmpc")
     assert controller.mpc.design.plant.known == ("rain", "price")
     assert np.allclose(inputs(controller)[[0, 10, 19], 0], FIRST, rtol=0, atol=1e-9)
 
 
 #: Inputs of the file's controller.
-FIRST = [0.058890309342, -0.470079744144, -0.43149202087]
+FIRST = [0.091678210799, -0.47064567492, -0.433742618204]
 
 
 # Files of other kinds

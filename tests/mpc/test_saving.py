@@ -70,7 +70,7 @@ def test_another_file_is_named(tmp_path):
         QPMPC.load(tmp_path / "none")
     for kind, version, message in (
         ("network", 1, "a saved network, expected a file that QPMPC.save wrote"),
-        ("QPMPC", 2, "whose format has version 2, expected version 1 to 1. A newer release w"),
+        ("QPMPC", 3, "whose format has version 3, expected version 1 to 2. A newer release w"),
     ):
         torch.save({"kind": kind, "version": version}, tmp_path / "other")
         with pytest.raises(QPError, match=f"^path: got .*/other, {message}"):

@@ -15,7 +15,7 @@ from torch_qpmpc.control.explain import Explanation, explain
 from torch_qpmpc.control.exporting import ControllerExport, export_controller, export_controller_fmu
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.learning import LearningReport, improve, learn
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target, packed, unpacked
+from torch_qpmpc.control.linear_mpc import LinearMPC, Target, check_theta, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, ready, simulate
@@ -35,8 +35,8 @@ class Controller:
 
     In each step a Kalman filter estimates the state x and constant disturbances w from the
     measured outputs; the steady state within the bounds that is nearest to the set-point is the
-    target; and the MPC plans to it. So constant disturbances, and errors of the model's gain, leave
-    no offset, and a set-point out of reach is tracked as near as the bounds allow.
+    target; and the MPC plans with it. So constant disturbances, and errors of the model's gain,
+    leave no offset, and a set-point out of reach is tracked as near as the bounds allow.
 
     Args:
         mpc: the MPC. Call `reset` when its plan's theta has changed.
@@ -51,7 +51,8 @@ class Controller:
     Attributes:
         status: the `Outcome` of the last step, SOLVED before the first.
         p: the input of the last plan, ``(n_p,)``.
-        target: the `Target` of the last plan, None before the first; with a preview, of all stages.
+        target: the `Target` of the last plan's last stage, None before the first; if inputs have a
+            weight and targets differ from stage to stage, those of all stages.
 
     Raises:
         QPError: an argument is invalid, or the model has no filter.
@@ -66,6 +67,14 @@ class Controller:
         ...     y = 0.9 * y[0] + 0.4 * u + 0.1
         >>> print(y.round(3))
         [1.]
+        >>> controller.review(r=[7.0]).faults[0].remedy
+        'Set y1 to 6, not 7, or widen u_bounds of u1.'
+        >>> controller.redesign(u_bounds=(-0.2, 0.2))
+        >>> run = controller.simulate(([[0.8]], [[0.6]]), 100, r=[0.5], load=0.1)
+        >>> controller.step(y, r=[4.0])
+        array([0.2])
+        >>> controller.explain().limits[0].signal
+        'u1'
     """
 
     def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
@@ -218,15 +227,6 @@ class Controller:
 
         Raises:
             QPError: an argument is invalid, or the MPC learns.
-
-        Example:
-            >>> import torch_qpmpc as qm
-            >>> model = ([[0.9]], [[0.5, 0.5]])
-            >>> mpc = qm.LinearMPC(model, 10, Q=1.0, dR=0.1, u_bounds=(-0.3, 0.3))
-            >>> controller = qm.Controller(mpc)
-            >>> controller.redesign(u_bounds={"u1": (-0.2, 0.2)}, noise=0.05)
-            >>> controller.step([0.0], r=[5.0])
-            array([0.2, 0.3])
         """
         self._law = ready(self._law.redesigned(**changes))
         u = np.clip(self.u, *self.mpc.design.u_bounds)
@@ -248,10 +248,11 @@ class Controller:
         """Return the controller that `save` wrote to ``path``; it goes on where that one was.
 
         Raises:
-            QPError: the file is missing or damaged, of another kind or a newer release, or holds
-                more than tensors and plain values.
+            QPError: the file is missing or damaged, of another kind or a newer release, has theta
+                of another cost, or holds more than tensors and plain values.
         """
         content = load_file(path, KIND)
+        check_theta(path, content)
         try:
             state = unpacked(content["controller"])
             options = {name: state.pop(name) for name in OPTIONS if name in state}
@@ -285,14 +286,6 @@ class Controller:
         Raises:
             QPError: an argument is invalid.
             SolverError: no input satisfies the hard bounds in a step.
-
-        Example:
-            >>> import torch_qpmpc as qm
-            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
-            >>> run = qm.Controller(mpc).simulate(([[0.8]], [[0.6]]), 100, r=[1.0], load=0.1)
-            >>> print(run.y[-1].round(3), run.cost[-1].round(3))
-            [1.] 0.0
-            >>> figure = run.plot()
         """
         return simulate(self._law.renewed(), self._memory, plant, steps, r, **options)
 
@@ -300,11 +293,10 @@ class Controller:
         """Identify the model again, and keep the new one if closed loops cost less with it.
 
         The loops must show that the design's own cost, `Run.costs`, falls by 1 %. Then the
-        controller starts again with the new model, from rest with its last input; otherwise it
-        stays as it is. Loops start where the last `reset` rests; with a log's model, at rest in the
-        middle of the set-points; with an environment, where its own reset says. Without a log the
-        filter takes a start that is not at rest for a disturbance, until it has settled. On a
-        terminal a bar shows the progress.
+        controller starts again with the new model, from rest with its last input. Loops start where
+        the last `reset` rests; with a log's model, at rest in the middle of the set-points; with an
+        environment, where its own reset says: without a log the filter takes a start that is not at
+        rest for a disturbance, until it has settled.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
@@ -323,20 +315,6 @@ class Controller:
             QPError: an argument is invalid, or the transitions determine no model with a steady
                 state and a filter.
             SolverError: no input satisfies the hard bounds in a step of this controller.
-
-        Example:
-            >>> import numpy as np, torch_qpmpc as qm
-            >>> mpc = qm.LinearMPC(([[0.5]], [[0.1]]), 5, Q=1.0, dR=1.0)  # a poor guess
-            >>> rng, y = np.random.default_rng(0), np.zeros(600)
-            >>> u = rng.uniform(-1, 1, 600)
-            >>> for k in range(599):
-            ...     y[k + 1] = 0.9 * y[k] + 0.5 * u[k] + 0.01 * rng.normal()
-            >>> controller = qm.Controller(mpc)
-            >>> log = qm.read_log({"y1": y, "u1": u}, outputs=["y1"], inputs=["u1"])
-            >>> controller.learn(log, steps=8).accepted
-            True
-            >>> controller.mpc.design.plant.A.round(2)
-            array([[0.9]])
         """
         law = self._law.renewed()
         report, candidate = learn(law, self._memory, source, transitions, **options)
@@ -389,14 +367,6 @@ class Controller:
         Raises:
             QPError: r or known is invalid.
             SolverError: the bounds of the inputs admit no steady state.
-
-        Example:
-            >>> import torch_qpmpc as qm
-            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
-            >>> controller = qm.Controller(mpc)
-            >>> review = controller.review(r=[7.0])
-            >>> review.faults[0].name, review.faults[0].remedy
-            ('set-points', 'Set y1 to 5, not 7, or widen u_bounds of u1.')
         """
         return review(self._law.renewed(), self._memory, r, known)
 
@@ -407,14 +377,6 @@ class Controller:
 
         Raises:
             QPError: the last call was no `step`.
-
-        Example:
-            >>> import torch_qpmpc as qm
-            >>> mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
-            >>> controller = qm.Controller(mpc)
-            >>> u = controller.step([0.0], r=[4.0])
-            >>> controller.explain().limits[0].signal
-            'u1'
         """
         if self._now is None:
             got, want = "no step since the last change", "a step to explain"
@@ -422,14 +384,7 @@ class Controller:
         return explain(self._law, self._memory, self.status, self._now, self.p)
 
     def export_c(
-        self,
-        folder: str | Path,
-        *,
-        dtype: str = "float64",
-        name: str = "policy",
-        max_iterations: int | None = None,
-        storage: str = "fast",
-        missing: bool = False,
+        self, folder: str | Path, *, name: str = "policy", **options: Any
     ) -> ControllerExport:
         """Write this controller as C99 without heap or dependencies.
 
@@ -439,12 +394,13 @@ class Controller:
 
         Args:
             folder: the folder of the files, created if it does not exist.
-            dtype, name, max_iterations, storage: as in `export_c`.
-            missing: True for a plant whose outputs are often missing: after a missing output the C
-                code carries the covariance of the estimates, as `step` does, until it is steady
-                again. It takes n_e^2 more numbers of state for n_e states and disturbances, tables
-                of twice as many, and about 4 n_e^3 operations in such a step. Otherwise the steady
-                gains stay, which is right for single missing outputs.
+            name: the beginning of the names in C.
+            options: ``dtype``, ``max_iterations`` and ``storage`` of `export_c`. ``missing``: True
+                for a plant whose outputs are often missing: after a missing output the C code
+                carries the covariance of the estimates, as `step` does, until it is steady again:
+                n_e^2 more numbers of state for n_e states and disturbances, tables of twice as
+                many, and about 4 n_e^3 operations in such a step. Otherwise the steady gains stay,
+                which is right for single missing outputs.
 
         Returns:
             Sizes and the measured agreement.
@@ -453,15 +409,7 @@ class Controller:
             QPError: as in `export_c`; the self-test fails; or inputs that r leaves free move
                 a bounded output without a weight, as their choice is not exact in C.
         """
-        law, options = self._law.renewed(), {"dtype": dtype, "name": name, "storage": storage}
-        return export_controller(
-            law,
-            self._memory,
-            folder,
-            max_iterations=max_iterations,
-            missing=missing,
-            **options,
-        )
+        return export_controller(self._law.renewed(), self._memory, folder, name=name, **options)
 
     def export_fmu(
         self, path: str | Path, *, name: str = "policy", **options: Any

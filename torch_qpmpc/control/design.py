@@ -259,29 +259,28 @@ class Design:
         prices = torch.where(outside > 0, torch.as_tensor(self.y_slack), 0.0)  # inf times 0 is none
         return cost + (prices * outside).sum(-1)
 
-    def arranged(
-        self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any, level: Any
-    ) -> Any:
+    def arranged(self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any) -> Any:
         """Return `LinearMPC.arrange`, for signals of one batch shape in torch's or numpy's arrays.
 
         Args:
             arrays: ``torch`` or ``np``.
             x, u_last: ``(*batch, n)`` and ``(*batch, m)``.
-            target: x_s, u_s and y_s, with a dimension for the stages if references are previewed.
-            known, level: ``(*batch, N + 1, n_d)`` and ``(*batch, n_d)``.
+            target: the parts of a `Target`, with a dimension for the stages if it is `staged`.
+            known: ``(*batch, N + 1, n_d)``.
         """
-        signals = self.acts, self.nominal, *self.bounded_places
-        acts, nominal, of_y, of_u = map(arrays.asarray, signals)
-        known = known - (level * acts + nominal)[..., None, :]
-        if self.references == "preview":
-            _, u_r, y_r = target
-            target = [part[..., -1, :] for part in target]
-            ahead = [y_r - y_r[..., -1:, :], u_r - u_r[..., -1:, :]][: 1 + self.R.any()]
-            known = arrays.concatenate((*ahead, known), -1)
-        x_s, u_s, y_s = target
+        signals = self.acts, self.nominal, self.weighted, *self.bounded_places
+        acts, nominal, of_r, of_y, of_u = map(arrays.asarray, signals)
+        ahead, (_, inputs, _, aims) = [known - (known[..., -1:, :] * acts + nominal)], target
+        x_s, u_s, y_s, r = (part[..., -1, :] for part in target) if self.staged else target
+        if self.staged and self.R.any():
+            ahead.insert(0, inputs - u_s[..., None, :])
+        off = [(y_s - r)[..., of_r]] if self.references == "held" else []
+        if not off:
+            ahead.insert(0, (aims - y_s[..., None, :])[..., of_r])
+        ahead = arrays.concatenate(ahead, -1)
         du = (u_last - u_s)[..., : len(self.R) if self.moves else 0]
-        parts = known.reshape(*known.shape[:-2], -1), x - x_s, du, y_s[..., of_y], u_s[..., of_u]
-        return arrays.concatenate((*parts, arrays.ones_like(x[..., :1])), -1)
+        parts = x - x_s, du, *off, y_s[..., of_y], u_s[..., of_u], arrays.ones_like(x[..., :1])
+        return arrays.concatenate((ahead.reshape(*ahead.shape[:-2], -1), *parts), -1)
 
     @cached_property
     def acts(self) -> Array:
@@ -293,6 +292,40 @@ class Design:
         """The places of the outputs and of the inputs with bounds."""
         of_y, of_u = map(np.flatnonzero, self.bounded)
         return of_y, of_u
+
+    @cached_property
+    def weighted(self) -> Array:
+        """The places of the outputs with a weight."""
+        return np.flatnonzero(self.Q.any(0))
+
+    @cached_property
+    def pulls(self) -> tuple[Array, Array]:
+        """The maps of y_s - r and of the last multipliers of the target to `weighed`'s pull."""
+        Y = self.steady.Y
+        rows, *_, of = self.rows(0, Y, np.zeros((len(self.plant.known), Y.shape[1])))
+        Y = Y[:, : self.steady.n_a]
+        moved = Y @ np.linalg.pinv(Y.T @ self.Q @ Y) @ Y.T
+        return moved @ self.Q, moved[:, of[rows.any(-1)]] / 2
+
+    def weighed(self, arrays: Any, r: Any, y_s: Any, lam: Any) -> Any:
+        """Return the set-points that the plan weighs: r, but for what bounds of outputs hold off.
+
+        Bounds after the horizon do not act, so that the plan would leave y_s with their part of
+        y_s - r. The signals are `arranged`'s, and ``lam`` ``(*batch, n_g)`` the target's.
+        """
+        moved, shifts, Q = map(arrays.asarray, (*self.pulls, self.Q))
+        if not shifts.shape[1]:
+            return r
+        own = (y_s - r) @ moved.T
+        pull = own + lam[..., -shifts.shape[1] :] @ shifts.T
+        size, share = ((pull @ Q * x).sum(-1)[..., None] for x in (pull, own))
+        return r + own - pull * (share / arrays.where(size > 0, size, 1.0)).clip(0, 1)
+
+    @cached_property
+    def staged(self) -> bool:
+        """True if a plan has targets that differ from stage to stage, for r or a weight of u."""
+        varies = self.acts.any() or self.limits
+        return self.references == "preview" or bool(self.R.any() and varies)
 
     def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
         """Return rows D with lower and upper bounds, and the place of the signal of each.
@@ -313,14 +346,15 @@ class Design:
     @cached_property
     def places(self) -> dict[str, slice]:
         """Return the places of the signals in a stage [d_k; x_k; u_k], see `LinearMPC`."""
-        n, m, n_y, n_d = self.plant.sizes
-        n_r = n_y if self.references == "preview" else 0
+        n, m, _, n_d = self.plant.sizes
+        previewed, n_r = self.references == "preview", len(self.weighted)
         parts = {
-            "r": n_r,
-            "u_r": m if n_r and self.R.any() else 0,
+            "r": n_r if previewed else 0,
+            "u_r": m if self.staged and self.R.any() else 0,
             "known": n_d,
             "x": n,
             "u_last": m if self.moves else 0,
+            "off": 0 if previewed else n_r,
             "y_s": int(self.bounded[0].sum()),
             "u_s": int(self.bounded[1].sum()),
             "one": 1,
@@ -404,7 +438,7 @@ def read_prices(
 
 
 def _check_apart(name: str, signal: str, plant: StateSpace) -> None:
-    """Raise `QPError` if a known signal acts on the plant: then p has it less its mean."""
+    """Raise `QPError` if a known signal acts on the plant: p has it less its last row."""
     if plant.E[:, plant.known.index(signal)].any():
         got, want = f"{signal!r}, which acts on the plant", "a signal with a column of zeros in E"
         raise QPError.expected(name, got, want, "Pass the signal twice.")

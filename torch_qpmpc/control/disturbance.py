@@ -78,10 +78,8 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
     if (hidden := _hidden(normal, _placed(normal, wanted))) is not None:
         got = f"{dict(wanted)}, whose {hidden} cannot be told from a mode at 1"
-        remedy = (
-            "At an integrating mode take a disturbance of its input, and at others one of the "
-            "output; 'auto' chooses so. There can be no more disturbances than outputs."
-        )
+        remedy = "At an integrating mode take a disturbance of its input, and at others one of the "
+        remedy += "output; 'auto' chooses so. There can be no more disturbances than outputs."
         raise QPError.expected("disturbances", got, "detectable disturbances", remedy)
     return _placed(plant, wanted)
 
@@ -215,12 +213,7 @@ class Steady:
 
     @classmethod
     def of(
-        cls,
-        plant: StateSpace,
-        w: Disturbances,
-        Q: Array,
-        R: Array,
-        scaling: Scaling | None = None,
+        cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array, scaling: Scaling | None = None
     ) -> Steady:
         """Return the steady states of ``plant`` with disturbances ``w`` and the weights Q and R.
 

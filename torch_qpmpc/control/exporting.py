@@ -23,6 +23,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.fmu import Variable, write_fmu
 from torch_qpmpc.export.library import FLAGS, compiled, compiler, required_compiler
+from torch_qpmpc.export.tables import make_tables
 from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
@@ -187,17 +188,10 @@ def export_controller(
         (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
         (folder / file).write_text(text, encoding="utf-8")
     own = sum(x.size for x in _tables(law, dtype, missing).values()) * np.dtype(dtype).itemsize
-    return ControllerExport(
-        tuple(folder / file for file in texts),
-        plan,
-        target,
-        free,
-        sum(part.table_bytes for part in reports) + own,
-        state_bytes,
-        len(loop.u),
-        None if difference is None else float(difference.max()),
-        missing,
-    )
+    own += sum(part.table_bytes for part in reports)
+    files = tuple(map(folder.joinpath, texts))
+    most = None if difference is None else float(difference.max())
+    return ControllerExport(files, plan, target, free, own, state_bytes, len(loop.u), most, missing)
 
 
 def export_controller_fmu(
@@ -290,10 +284,8 @@ def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:
             rows.append((y, r[stages], known, move.u))
     except (QPError, SolverError) as error:  # no plan, or outputs above `Law.max_plausible`
         if not rows:
-            raise SolverError(
-                "No input satisfies the hard bounds at rest: widen them, or give the outputs a "
-                "y_slack."
-            ) from error
+            remedy = "widen them, or give the outputs a y_slack"
+            raise SolverError(f"No input satisfies the hard bounds at rest: {remedy}.") from error
     y, r, known, u = map(np.array, zip(*rows, strict=True))
     return Loop(y, r, known, u, course["u"][None])
 
@@ -322,7 +314,8 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
     tables = [array(key, x, dtype) for key, x in _tables(law, dtype, missing).items()]
     indices = {
-        f"OF_{key}": places for key, places in zip("YU", design.bounded_places, strict=True)
+        f"OF_{key}": places
+        for key, places in zip("RYU", (design.weighted, *design.bounded_places), strict=True)
     } | dict(zip(("LOWER_OF", "UPPER_OF"), design.limited[1], strict=True))
     tables += [
         f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
@@ -334,16 +327,13 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict
         for key, x in replayed._asdict().items()
     }
     examples["NEAR_U"] = NEAR[dtype] * design.scaling.u
+    shown = [f"#define EXAMPLES {len(replayed.u)}"]
+    shown += [array(key, x, dtype) for key, x in examples.items()]
     parts = {
         "/* @HEADER@ */": comment(_signals(law.design.plant, name)),
         "/* @SIZES@ */": defined,
         "/* @TABLES@ */": "\n".join([f"#define BIG {CONSTANTS[dtype]['BIG']}", *tables]),
-        "/* @EXAMPLES@ */": "\n".join(
-            [
-                f"#define EXAMPLES {len(replayed.u)}",
-                *(array(key, x, dtype) for key, x in examples.items()),
-            ]
-        ),
+        "/* @EXAMPLES@ */": "\n".join(shown),
     }
     return {f"{name}.{end}": filled(f"controller.{end}", name, parts) for end in "hc"}
 
@@ -377,6 +367,8 @@ def _sizes(law: Law) -> dict[str, int]:
         "SET_POINTS": stages if design.references == "preview" else 1,
         "N_R": width["r"],
         "N_UR": width["u_r"],
+        "OFF": width["off"],
+        "PULLS": int(design.pulls[1].size > 0),
         "MOVES": width["u_last"],
         "BOUNDED_Y": width["y_s"],
         "BOUNDED_U": width["u_s"],
@@ -391,6 +383,8 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
     if missing:
         own |= {"S": S, "FIRST": first, "LS": LS, "LSL": LS @ observer.L.T}
         own |= {"OF_S": np.sqrt(np.diag(S)), "STEADY": np.array([STEADY])}
+    if design.pulls[1].size:
+        own |= _pulls(law.mpc)
     return {
         **{key.upper(): x for key, x in own.items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
@@ -403,6 +397,14 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
         "MOST_U": law.max_plausible_u,
     }
+
+
+def _pulls(mpc: LinearMPC) -> dict[str, Array]:
+    """Return the maps of `Design.weighed`, the second one with a column a row of the tables."""
+    (own, shifts), tables = mpc.design.pulls, make_tables(mpc.targets)
+    n_g = len(mpc.targets.quadratic_program().lb)
+    shifts = np.pad(shifts, ((0, 0), (n_g - shifts.shape[1], 0)))[:, tables.places]
+    return {"moved": own, "shifts": shifts / tables.rows.unit, "Q": mpc.design.Q}
 
 
 def _moves(mpc: LinearMPC, dtype: str) -> Array:

@@ -206,14 +206,17 @@ class Law:
             memory = memory._replace(r=r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
-        n, qp, level = len(design.plant.A), self.mpc.plan, known.mean(0)
-        previewed, aimed = design.references == "preview", []
-        for row in r if previewed else r[:1]:
-            if (steady := self._aimed(row, e[n:], level)) is None:
+        n, qp, aimed, last, steady = len(design.plant.A), self.mpc.plan, [], None, None
+        r = r if design.references == "preview" else r[0]
+        rows = np.hstack((np.broadcast_to(r, (len(known), len(design.Q))), known))
+        for row in rows[0 if design.staged else -1 :]:
+            if not aimed or (row != last).any():
+                last, steady = row, self._aimed(*np.split(row, [len(design.Q)]), e[n:])
+            if steady is None:
                 return self._held(memory, e, Outcome.INFEASIBLE)
             aimed.append(steady)
-        steady = [*map(np.stack, zip(*aimed, strict=True))] if previewed else aimed[0]
-        p = design.arranged(np, e[:n], steady, memory.u, known, level)
+        steady = [*map(np.stack, zip(*aimed, strict=True))] if design.staged else aimed[0]
+        p = design.arranged(np, e[:n], steady, memory.u, known)
         z, found, ahead = self._planned(p, memory)
         if found not in (Status.SOLVED, Status.NODE_LIMIT):
             proved = found == Status.INFEASIBLE
@@ -282,9 +285,10 @@ class Law:
         memory = memory._replace(ahead=None)
         return Move(u, self._after(memory, e, u), status)
 
-    def _aimed(self, r: Array, w: Array, level: Array) -> list[Array] | None:
-        """Return x, u and y of `LinearMPC.target` of a set-point; None if a QP has no solution."""
-        loads, v, known = np.concatenate((w, level - self.design.nominal, [1.0])), np.zeros(0), r
+    def _aimed(self, r: Array, d: Array, w: Array) -> list[Array] | None:
+        """Return the parts of `LinearMPC.target` of a set-point; None if a QP has no solution."""
+        loads, v, known = np.concatenate((w, d - self.design.nominal, [1.0])), np.zeros(0), r
+        multipliers = []
         for aims in self.aims:
             state = np.concatenate((known, loads))
             solution = aims.solve(state[None])
@@ -292,8 +296,9 @@ class Law:
                 return None
             known = solution.z[0, len(state) : -len(state)]
             v = np.concatenate((v, known))
-        maps = self.design.steady.maps
-        return [Z @ v + M @ loads for Z, M in maps]
+            multipliers.append(solution.lam[0])
+        x, u, y = (Z @ v + M @ loads for Z, M in self.design.steady.maps)
+        return [x, u, y, self.design.weighed(np, r, y, multipliers[0])]
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.

@@ -133,18 +133,8 @@ def learn(
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
     before, after = np.mean(costs, axis=0)
-    report = LearningReport(
-        test.decision == "better",
-        float(before),
-        float(after),
-        test.pairs,
-        test.interval,
-        steps,
-        log.steps,
-        plant.name,
-        model,
-    )
-    return report, candidate
+    shown = test.decision == "better", float(before), float(after), test.pairs, test.interval
+    return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 
 def _environment(
@@ -329,7 +319,7 @@ def steady(design: Design, plan: QPMPC) -> dict[str, Tensor]:
     At rest all signals of a stage are zero but the constants at the end of its state, which place
     the bounds. Its plan stays zero if no cost and no prediction depends on them.
     """
-    layout, constants = plan.layout, sum(map(len, design.bounded_places)) + 1
+    layout, constants = plan.layout, design.places["one"].stop - design.places["off"].start
     fixed = torch.arange(plan.n_x) >= plan.n_x - constants
     stage = F.pad(fixed, (plan.n_d, plan.n_u))
     of_z = F.pad(layout.stages(fixed, fixed.new_zeros(plan.n_u)), (layout.n_preview, 0))
@@ -367,9 +357,8 @@ class ControlledPlant(SimulatedPlant):
     def starts(self, rng: torch.Generator, count: int) -> Tensor:
         s = super().starts(rng, count)
         row = self._row(s)[:, 0]
-        return self._planned(
-            s, self._u[(row - 1).maximum(self._first[row])], self._aims(rng, count)
-        )
+        u_last = self._u[(row - 1).maximum(self._first[row])]
+        return self._planned(s, u_last, self._aims(rng, count))
 
     def draw(self, rng: torch.Generator, count: int) -> Tensor:
         return torch.cat((super().draw(rng, count), self._aims(rng, count)), -1)
@@ -387,8 +376,10 @@ class ControlledPlant(SimulatedPlant):
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return `Run.costs` of a step, ``(count,)``."""
-        base, u_last, r, u_s, _ = s.split(self._ends, -1)
+        base, u_last, r, u_s, p = s.split(self._ends, -1)
         y, u, d = self._parts(base)[2], self._input(s, a), self._ahead(base)[:, 0]
+        if (place := self._design.places["u_r"]).stop > place.start:  # p begins with a stage
+            u_s = u_s + p[:, place]
         return self._design.costs(y, r, u, u_s, u - u_last, d)
 
     def _aims(self, rng: torch.Generator, count: int) -> Tensor:
@@ -406,9 +397,8 @@ class ControlledPlant(SimulatedPlant):
     def _planned(self, base: Tensor, u_last: Tensor, r: Tensor) -> Tensor:
         """Return the states with the target and p of the next plan."""
         x, w = self._parts(base)[1].tensor_split([len(self._design.plant.A)], -1)
-        known, preview = self._ahead(base, self._horizon), self._design.references == "preview"
-        level = known.mean(1)
-        loads = [v[:, None].expand(-1, known.shape[1], -1) if preview else v for v in (r, w, level)]
-        target = self._mpc.target(*loads)
-        p = self._mpc.arrange(x, target, u_last=u_last, known=known, level=level)
-        return torch.cat((base, u_last, r, target.u[:, -1] if preview else target.u, p), -1)
+        known, staged = self._ahead(base, self._horizon), self._design.staged
+        ahead = [v[:, None].expand(-1, known.shape[1], -1) for v in (r, w)]
+        target = self._mpc.target(*ahead, known) if staged else self._mpc.target(r, w, known[:, -1])
+        p = self._mpc.arrange(x, target, u_last=u_last, known=known)
+        return torch.cat((base, u_last, r, target.u[:, -1] if staged else target.u, p), -1)

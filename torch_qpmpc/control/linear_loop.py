@@ -129,9 +129,10 @@ def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, 
     a = s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
     # Without bounds the free inputs are least: f = 0.
     f = a.new_zeros(len(a), design.steady.Y.shape[1] - a.shape[1])
-    aimed = mpc.steady_state(torch.cat((a, f), -1), s)
+    lam = s.new_zeros(len(s), len(mpc.targets.quadratic_program().lb))
+    aimed = mpc.steady_state(torch.cat((a, f), -1), s, lam)
     stages = aimed
-    if design.references == "preview":
+    if design.staged:
         stages = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))
     p = mpc.arrange(x, stages, u_last=u_last)
     u = aimed.u.numpy() + p.numpy() @ plan.K.T + plan.k

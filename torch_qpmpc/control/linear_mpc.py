@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -30,7 +30,7 @@ from torch_qpmpc.control.lowering import free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.files import VERSION, damaged, load_file, save_file
 from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
@@ -38,11 +38,15 @@ from torch_qpmpc.mpc.state import KIND, check_own, stored
 
 
 class Target(NamedTuple):
-    """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``."""
+    """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``.
+
+    The plan weighs the set-points r ``(*batch, n_y)``, see `Design.weighed`.
+    """
 
     x: Tensor
     u: Tensor
     y: Tensor
+    r: Tensor
 
 
 #: The options of a plan's `QPMPC`.
@@ -54,19 +58,21 @@ class LinearMPC:
 
     The plan's cost is the sum over the stages of
 
-        (y - y_s)'Q(y - y_s) + (u - u_s)'R(u - u_s) + du'dR du + price u,    du = u_k - u_{k-1},
+        (y - r)'Q(y - r) + (u - u_s)'R(u - u_s) + du'dR du + price u,    du = u_k - u_{k-1},
 
-    without a half, about the target: the steady state (x_s, u_s, y_s) of the model that is nearest
-    to the set-point r within the bounds, so that R moves no output off r. The terminal cost is the
-    Riccati equation's about (x_s, u_s) if it has a stabilising solution, else y_N's.
+    without a half, with the set-point r, the input u_s of the target and the known signals of each
+    stage. The target is the steady state (x_s, u_s, y_s) of the model that is nearest to r within
+    the bounds, so that R moves no output off r. The terminal cost is the Riccati equation's about
+    the last stage's target if it has a stabilising solution, with the slope that an endless loop
+    has there if r is out of reach; else it is y_N's.
 
-    All signals are deviations from the target, which keeps the values near it exact. p has d_0, ..,
-    d_N, the known signals, less their mean if they act on the plant; then the
-    state [x - x_s; u_last - u_s; y_s; u_s; 1].
-    u_last is in it if moves cost or are bounded, and y_s and u_s have the entries with bounds.
-    The last entry adds a small constant to the values, which their errors are relative to. With
-    ``references="preview"`` d_k begins with the set-points and inputs of later stages. `target` and
-    `arrange` make p, and the `plan`'s policy is u - u_s; `Controller` does all of it.
+    All signals are deviations from the last target, which keeps the values near it exact. p has
+    d_0, .., d_N, the known signals, less the last ones if they act on the plant; then the state
+    [x - x_s; u_last - u_s; y_s - r; y_s; u_s; 1]. u_last is in it if moves cost or are bounded,
+    y_s - r has the outputs with a weight, and y_s and u_s have the entries with bounds. The last
+    entry adds a small constant to the values, which their errors are relative to. A preview of
+    references has r - y_s in d_k instead, and if inputs have a weight d_k has the u_s of its stage.
+    `target` and `arrange` make p, and the `plan`'s policy is u - u_s; `Controller` does all of it.
 
     Args:
         model, E, dt, inputs, outputs, known: the plant; see `read_model`.
@@ -245,12 +251,13 @@ class LinearMPC:
         """Return the LinearMPC that `save` wrote to ``path``, with all of theta.
 
         Raises:
-            QPError: as in `QPMPC.load`, or the file has no design.
+            QPError: as in `QPMPC.load`, or the file has no design, or theta of another cost.
         """
         content = load_file(path, KIND, "LinearMPC.save")
         if "design" not in content:
             remedy = "QPMPC.load reads it."
             raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)
+        check_theta(path, content)
         try:
             return cls.of_stored(content)
         except Exception as error:  # damaged files raise errors of any type
@@ -283,77 +290,71 @@ class LinearMPC:
         Args:
             r: ``(*batch, n_y)``.
             w: the disturbances ``(*batch, n_w)``, or a number for all.
-            known: the level of the known signals, ``(*batch, n_d)``, or a number for all; by
-                default `Design.nominal`.
+            known: the known signals ``(*batch, n_d)``, or a number for all; by default
+                `Design.nominal`.
 
         Raises:
             QPError: a shape is wrong.
         """
-        s = self._target_inputs(r, w, known)
-        v = self.targets.policy(s, qp=self._target_qps[0])
+        nominal = torch.from_numpy(self.design.nominal)
+        values = {"r": r, "w": w, "known": nominal if known is None else known}
+        sizes = len(self.design.Q), len(self.design.disturbances.names), len(nominal)
+        parts = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in values.items()}
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
+        r, w, known = _expanded(parts, zip(sizes), batch)
+        s = torch.cat((r, w, known - nominal, r.new_ones(*batch, 1)), -1)
+        solution = self.targets.solve(s, qp=self._target_qps[0])
+        v = self.targets.predicted(solution.z)[1][..., 0, :]
         if self.free is not None:
             state = torch.cat((v, s[..., len(self.design.Q) :]), -1)
             v = torch.cat((v, self.free.policy(state, qp=self._target_qps[1])), -1)
-        return self.steady_state(v, s)
+        return self.steady_state(v, s, solution.lam)
 
-    def steady_state(self, v: Tensor, s: Tensor) -> Target:
-        """Return the steady state of ``v`` and ``s = [r; w; d; 1]``, by the maps of ``steady``."""
-        steady = self.design.steady
-        loads = s[..., len(steady.y) :]
-        maps = steady.maps
-        return Target(*(v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in maps))
-
-    def _target_inputs(self, r: Any, w: Any, known: Any) -> Tensor:
-        """Return [r; w; d; 1] ``(*batch, n_y + n_w + n_d + 1)``."""
-        sizes = {"r": len(self.design.Q), "w": len(self.design.disturbances.names)}
-        sizes["known"] = self.design.plant.sizes[3]
-        parts = {"r": r, "w": w, "known": self.design.nominal if known is None else known}
-        parts = {k: torch.as_tensor(x, dtype=torch.float64) for k, x in parts.items()}
-        for name, part in parts.items():
-            if part.ndim and part.shape[-1] != sizes[name]:
-                got, want = f"shape {tuple(part.shape)}", f"(*batch, {sizes[name]})"
-                raise QPError.expected(name, got, want)
-        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
-        parts["known"] = parts["known"] - torch.from_numpy(self.design.nominal)
-        parts = [part.expand(*batch, sizes[name]) for name, part in parts.items()]
-        return torch.cat((*parts, parts[0].new_ones(*batch, 1)), -1)
+    def steady_state(self, v: Tensor, s: Tensor, lam: Tensor) -> Target:
+        """Return the `Target` of ``v``, ``s = [r; w; d; 1]`` and the multipliers ``lam``."""
+        r, loads = s.tensor_split([len(self.design.Q)], -1)
+        maps = self.design.steady.maps
+        x, u, y = (v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in maps)
+        return Target(x, u, y, self.design.weighed(torch, r, y, lam))
 
     def arrange(self, x: Any, target: Target, **signals: Any) -> Tensor:
         """Return p ``(*batch, n_p)`` in float64.
 
         Args:
             x: the state, ``(*batch, n)``.
-            target: the `target`; with a preview of references one for each stage,
-                ``(*batch, N + 1, ..)``; p is relative to the last one.
-            signals: ``u_last`` ``(*batch, m)``, u_s if left out; ``known`` ``(*batch, N + 1, n_d)``
-                and the ``level`` ``(*batch, n_d)`` that the target is for; by default
-                zero, and bounds as `Design.nominal`.
+            target: the `target` of the last stage; if the design is `staged`, one for each stage,
+                ``(*batch, N + 1, ..)``.
+            signals: ``u_last`` ``(*batch, m)``, u_s if left out, and ``known``
+                ``(*batch, N + 1, n_d)``, by default zero, and bounds as `Design.nominal`.
 
         Raises:
             QPError: a name or a shape is wrong.
         """
-        if unknown := sorted(signals.keys() - {"u_last", "known", "level"}):
-            raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known, level")
+        if unknown := sorted(signals.keys() - {"u_last", "known"}):
+            raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known")
         design, (n, m, n_y, n_d) = self.design, self.design.plant.sizes
-        rows = self.horizon + 1 if design.references == "preview" else 0
-        batch = torch.as_tensor(x).shape[:-1]
-        defaults = {"u_last": target.u[..., -1, :] if rows else target.u, "level": 0.0}
-        values = {"x": x, "known": torch.from_numpy(design.nominal), **defaults, **signals}
-        shapes = {"x": (n,), "u_last": (m,), "known": (self.horizon + 1, n_d), "level": (n_d,)}
+        last, stages = target.u[..., -1, :] if design.staged else target.u, [self.horizon + 1]
+        values = {"x": x, "known": torch.from_numpy(design.nominal), "u_last": last, **signals}
         values |= {f"target.{name}": part for name, part in target._asdict().items()}
-        sizes = zip("xuy", (n, m, n_y), strict=True)
-        shapes |= {f"target.{name}": (rows, size)[not rows :] for name, size in sizes}
-        for name, shape in shapes.items():
-            value = torch.as_tensor(values[name], dtype=torch.float64)
-            try:
-                values[name] = value.expand(*batch, *shape)
-            except RuntimeError as error:
-                want = f"{shape[-1]} entries, and batch dimensions as those of x"
-                raise QPError.expected(name, f"shape {tuple(value.shape)}", want) from error
-        steady = [values[f"target.{name}"] for name in "xuy"]
-        return design.arranged(
-            torch, values["x"], steady, values["u_last"], values["known"], values["level"]
-        )
+        shapes = [[n], [*stages, n_d], [m]]
+        shapes += [[*stages * design.staged, size] for size in (n, m, n_y, n_y)]
+        x, known, u_last, *steady = _expanded(values, shapes, torch.as_tensor(x).shape[:-1])
+        return design.arranged(torch, x, steady, u_last, known)
+
+
+def _expanded(
+    values: Mapping[str, Any], shapes: Iterable[Sequence[int]], batch: Sequence[int]
+) -> list[Tensor]:
+    """Return values of the shapes ``(*batch, *shape)`` in float64, which errors name."""
+    expanded = []
+    for (name, value), shape in zip(values.items(), shapes, strict=True):
+        part = torch.as_tensor(value, dtype=torch.float64)
+        try:
+            expanded.append(part.expand(*batch, *shape))
+        except RuntimeError as error:
+            want = f"{shape[-1]} entries, and batch dimensions as those of the others"
+            raise QPError.expected(name, f"shape {tuple(part.shape)}", want) from error
+    return expanded
 
 
 def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[str, Any]:
@@ -384,6 +385,13 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
             wishes[name], own = read_limits(name, wishes[name], names, plant)
             limits = {key: pair for key, pair in limits.items() if key not in names} | own
     return {name: readers[name](name, x) for name, x in wishes.items()} | {"limits": limits}
+
+
+def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Raise `QPError` if a file has learned theta of a plan in another format."""
+    if content["version"] < VERSION and content["arguments"]["learn"]:
+        got, want = f"{path}, whose plan has learned another cost", f"a file of version {VERSION}"
+        raise QPError.expected("path", got, want, "Learn again: its design and log go on.")
 
 
 def read_stored(content: Mapping[str, Any]) -> Design:

@@ -1,5 +1,14 @@
 """Lower a design onto schemes: the QP of the plan, in deviations from the target, and the target's.
 
+The plan's stages weigh y_k - r_k. Where bounds of inputs keep the target's outputs y_s off r, the
+cost of an endless loop about the target has a slope lam'(x - x_s), and so has the terminal cost:
+
+    lam = gamma A'lam + 2 C'Q (y_s - r).
+
+With it the plan rests at the target whatever its horizon (Zanon and Faulwasser, "Economic MPC
+without terminal constraints: gradient-correcting end penalties enforce asymptotic stability",
+J. Process Control 63, 2018). Of bounds of outputs see `Design.weighed`.
+
 The target is the steady state within bounds that is nearest to the set-point:
 
     min over v of (y_s - r)'Q(y_s - r) + price violation(y_s),   u_s within its bounds,
@@ -47,6 +56,8 @@ PREFERENCE = 1e-8
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep, relative
 #: to the default one.
 HARD = 1e3
+#: The least eigenvalue of a Riccati weight, relative to the largest, that is not rounding.
+TINY = 1e-12
 #: The price of a bound of u_s that a load or rounding may make impossible to keep, in units of the
 #: cost's slope.
 NEARLY_HARD = 1e3
@@ -63,20 +74,22 @@ def lowered(design: Design) -> Scheme:
 
 
 def _model(design: Design) -> Model:
-    """Return the model of [x; u_last; y_s; u_s; 1], where y_s and u_s stay."""
+    """Return the model of [x; u_last; y_s - r; y_s; u_s; 1], where all but x and u_last stay."""
     s, plant = design.selectors(), design.plant
     n_d = design.places["known"].stop
     x = plant.A @ s["x"] + plant.B @ s["u"] + plant.E @ s["known"]
-    rows = np.vstack((x, s["u"][: len(s["u_last"])], s["y_s"], s["u_s"], s["one"]))
+    stay = (s[name] for name in ("off", "y_s", "u_s", "one"))
+    rows = np.vstack((x, s["u"][: len(s["u_last"])], *stay))
     n_x = n_d + len(rows)
     return Model(rows[:, n_d:n_x], rows[:, n_x:], rows[:, :n_d])
 
 
 def _cost(design: Design, layout: Layout) -> Cost:
-    """Return the squares of deviations from the target, and the prices."""
+    """Return the squares of y - r and of deviations from the target, and the prices."""
     s, places, plant = design.selectors(), design.places, design.plant
     y, u = plant.C @ s["x"], s["u"].copy()
-    y[: len(s["r"])] -= s["r"]
+    off = s["off"] if design.references == "held" else -s["r"]
+    y[design.weighted] += off
     u[: len(s["u_r"])] -= s["u_r"]
     du = [s["u"] - s["u_last"]] if design.moves else []
     T = np.vstack((y, u, *du))
@@ -93,9 +106,12 @@ def _cost(design: Design, layout: Layout) -> Cost:
     one = places["one"].start
     stage[one, one] = 2 * SCALE * design.typical
     size = places["u"].start
-    P = riccati(design)
-    x = np.vstack((s["x"], s["u_last"]))[:, :size]
-    terminal = _squares(y[:, :size], design.Q) if P is None else _squares(x, P / 2)
+    P, x, off = riccati(design), np.vstack((s["x"], s["u_last"]))[:, :size], off[:, :size]
+    if P is None:
+        terminal = _squares(y[:, :size], design.Q)
+    else:
+        L, W = _slope(design, P)
+        terminal = _squares(x, P / 2) + _squares(off, W / 2) + x.T @ L @ off + off.T @ L.T @ x
     q = layout.from_stage(torch.as_tensor(linear).expand(layout.horizon, 1, -1)).sum(0)
     return Cost(stage, terminal, hessian="block", q=q)
 
@@ -104,6 +120,27 @@ def _squares(T: Array, weight: Any) -> Array:
     """Return ``2 T' weight T``, whose rounding is asymmetric, made symmetric."""
     half = T.T @ weight @ T
     return half + half.T
+
+
+def _slope(design: Design, P: Array) -> tuple[Array, Array]:
+    """Return L and W with x'P x + 2 x'L off + off'W off >= 0, where L off is the target's slope.
+
+    ``off`` is y_s - r of the outputs with a weight. Modes at one, whose state inputs choose, take
+    the part of the slope that moves no input.
+    """
+    normal, (of_y, of_u, of_x, _), of_r = design.normal, design.scaling, design.weighted
+    A, B, C = normal.plant.A, normal.plant.B, normal.plant.C
+    still, right = np.eye(len(A)) - design.gamma * A.T, 2 * C.T @ normal.Q[:, of_r]
+    response = np.linalg.pinv(still, rcond=RANK)
+    size, slope = np.linalg.norm(response) * np.linalg.norm(right), response @ right
+    free = scipy.linalg.null_space(still, rcond=RANK)
+    slope = slope - free @ np.linalg.pinv(B.T @ free, rcond=RANK) @ (B.T @ slope)
+    slope[np.abs(slope) < RANK * size] = 0.0  # rounding would set the lengths of the QP
+    L, sizes = np.pad(slope, ((0, len(P) - len(A)), (0, 0))), np.concatenate((of_x, of_u))[: len(P)]
+    values, V = np.linalg.eigh(P * np.outer(sizes, sizes))
+    own = V.T @ L / np.sqrt(np.maximum(values, TINY * values[-1]))[:, None]
+    of_r = of_y[of_r]
+    return L / np.outer(sizes, of_r), own.T @ own / np.outer(of_r, of_r)
 
 
 def riccati(design: Design) -> Array | None:
@@ -285,11 +322,8 @@ def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Arr
         ends = np.sort(factor * np.stack((lower[chosen], upper[chosen])), axis=0).sum(-1)
         if np.isfinite(ends).any():
             left.append((factor @ D[chosen], *ends))
-    rows, lower, upper = (
-        (np.array(part) for part in zip(*left, strict=True))
-        if left
-        else (D[:0], lower[:0], upper[:0])
-    )
+    parts = zip(*left, strict=True) if left else (D[:0], lower[:0], upper[:0])
+    rows, lower, upper = map(np.array, parts)
     rows[np.abs(rows) < RANK] = 0.0
     return rows, lower, upper
 

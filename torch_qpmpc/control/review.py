@@ -112,7 +112,9 @@ def _cost(mpc: LinearMPC) -> Finding:
     """H is positive definite on the plans that satisfy C z = b, in signals divided by sizes."""
     qp, design = mpc.plan.quadratic_program(), mpc.design
     y, u, x, _ = design.scaling
-    state = (x, u[: len(u) * design.moves], y[design.bounded[0]], u[design.bounded[1]], [1.0])
+    off = y[design.weighted[: 0 if design.references == "preview" else None]]
+    of_y, of_u = design.bounded
+    state = (x, u[: len(u) * design.moves], off, y[of_y], u[of_u], [1.0])
     later = np.tile(np.concatenate((u, *state)), mpc.horizon)
     units = np.concatenate((np.ones(mpc.plan.n_p), later))
     H, C = (x.detach().double().numpy() * units for x in (qp.H, qp.C))
@@ -202,10 +204,10 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     x = rest.x.numpy() + np.vstack((x, np.zeros((2, len(of_x)))))
     ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
     u_last = np.vstack((np.tile(rest.u, (len(off), 1)), ends))
-    stages = (len(x), mpc.horizon + 1) if design.references == "preview" else (len(x),)
+    stages = (len(x), mpc.horizon + 1) if design.staged else (len(x),)
     target = Target(*(part.expand(*stages, -1) for part in rest))
     ahead = np.tile(known, (len(x), mpc.horizon + 1, 1))
-    p = mpc.arrange(x, target, u_last=u_last, known=ahead, level=known)
+    p = mpc.arrange(x, target, u_last=u_last, known=ahead)
     status = solve_qp(mpc.plan.quadratic_program(), p, solver="daqp", on_failure="mask").status
     hard = design.bounded[0] & np.isinf(design.y_slack)
     names = ", ".join(name for name, x in zip(design.plant.outputs, hard, strict=True) if x)

@@ -68,27 +68,17 @@ class Run:
         from torch_qpmpc.analysis.plots import episode_figure  # imports matplotlib
 
         plant = self.design.plant
-        step = 1.0 if plant.dt is None else plant.dt
-        times, y, u, r = (
-            torch.from_numpy(x) for x in (step * np.arange(len(self.y)), self.y, self.u, self.r)
-        )
-        signals = {
-            plant.label(name): torch.from_numpy(x)
-            for name, x in zip(plant.known, self.known.T.copy(), strict=True)
-        }
         known = np.vstack((self.known, self.known[-1:]))
-        lower, upper = map(torch.from_numpy, self.design.bounds_at(known)[0])
-        return episode_figure(
-            times,
-            y,
-            u,
-            signals=signals,
-            band=(lower, upper),
-            references=r,
-            outputs=[plant.label(name) for name in plant.outputs],
-            actions=[plant.label(name) for name in plant.inputs],
-            xlabel="step" if plant.dt is None else "time",
+        times = (plant.dt or 1.0) * np.arange(len(self.y))
+        signals = times, self.y, self.u, self.r, *self.design.bounds_at(known)[0]
+        times, y, u, r, lower, upper = map(torch.from_numpy, signals)
+        outputs, inputs, names = (
+            [*map(plant.label, x)] for x in (plant.outputs, plant.inputs, plant.known)
         )
+        known = dict(zip(names, map(torch.from_numpy, self.known.T.copy()), strict=True))
+        options = {"band": (lower, upper), "references": r, "outputs": outputs, "actions": inputs}
+        xlabel = "step" if plant.dt is None else "time"
+        return episode_figure(times, y, u, signals=known, xlabel=xlabel, **options)
 
 
 def simulate(
@@ -102,7 +92,7 @@ def simulate(
     signals, moves, following = zip(*loop, strict=True)
     y, r, d = ([getattr(x, name) for x in signals] for name in ("y", "r", "known"))
     y, r = [*y, following[-1]], [*(x[0] for x in r), r[-1][1]]
-    inputs, u_s = [move.u for move in moves], [_first(move.target.u) for move in moves]
+    inputs, u_s = [move.u for move in moves], [np.atleast_2d(x.target.u)[0] for x in moves]
     y, r, inputs, d, u_s = map(np.array, (y, r, inputs, [x[0] for x in d], u_s))
     return Run(law.design, y, r, inputs, d, u_s, begun.u)
 
@@ -177,11 +167,6 @@ def closed_loop(
         yield signals, move, y
 
 
-def _first(target: torch.Tensor) -> Array:
-    """Return the part of a target of the first stage."""
-    return target.numpy().reshape(-1, target.shape[-1])[0]
-
-
 class _Model:
     """A model with Gymnasium's ``reset`` and ``step``, which starts at rest with the input u.
 
@@ -226,11 +211,8 @@ class _Model:
 
 def ready(law: Law) -> Law:
     """Return a law with factored QPs and compiled code, by steps with active bounds and without."""
-    memory, rows, y = (
-        law.begun(rests=True),
-        (law.design.horizon + 1, 1),
-        law.design.middle,
-    )
+    memory, rows = law.begun(rests=True), (law.design.horizon + 1, 1)
+    y = law.design.middle
     known = np.tile(last_known(law.design, memory), rows)
     for r in (y + 100.0 * law.design.usual, y):
         memory = law.step(memory, y, np.tile(r, rows), known).memory

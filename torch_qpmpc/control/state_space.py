@@ -133,8 +133,8 @@ def read_model(
         if dt is not None:
             remedy = (
                 "scipy.signal.lti(A, B, C, D) is sampled with dt; of matrices that are sampled "
-                "already, pass scipy.signal.dlti(A, B, C, D, dt=dt), without dt."
             )
+            remedy += "already, pass scipy.signal.dlti(A, B, C, D, dt=dt), without dt."
             want = "None: they are those of one step, x+ = A x + B u"
             raise QPError.expected("dt", f"{dt:g} with matrices", want, remedy)
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))

@@ -5,7 +5,7 @@
    nearest to the set-point, or two if that leaves inputs free; and a QP for the plan to it.
 
        e  is corrected by L_k (y - H e), and predicted by F e + G u + E d + OFFSET
-       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; level; 1], v by the target's QPs
+       [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; known; 1], v by the target's QPs
        u = u_s + the plan's first input, within the bounds */
 
 typedef policy_real real;
@@ -194,13 +194,37 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
     return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
 }
 
-/* Set the target for the set-point of a stage; return the code of its QPs. */
-static int aim(policy_state *s, const real r[], const real level[])
+/* Set the set-points that the plan weighs: r, but for what the outputs' bounds hold off. */
+static void weigh(policy_state *s, const real r[])
+{
+#if POLICY_PULLS
+    real off[N_Y], own[N_Y] = {0}, pull[N_Y], size = 0, share = 0;
+    int i;
+    for (i = 0; i < N_Y; i++) off[i] = s->y_s[i] - r[i];
+    add(own, &MOVED[0][0], N_Y, N_Y, off);
+    copy(pull, own, N_Y);
+    add(pull, &SHIFTS[0][0], N_Y, POLICY_TARGET_ROWS, s->target.lambda);
+    for (i = 0; i < N_Y; i++) {
+        real weighed = 0;
+        add(&weighed, Q[i], 1, N_Y, pull);
+        size += weighed * pull[i];
+        share += weighed * own[i];
+    }
+    if (share > size) share = size;
+    share = share > 0 ? share / size : 0;
+    for (i = 0; i < N_Y; i++) s->aims[i] = r[i] + own[i] - share * pull[i];
+#else
+    copy(s->aims, r, N_Y);
+#endif
+}
+
+/* Set the target for the signals of a stage; return the code of its QPs. */
+static int aim(policy_state *s, const real r[], const real known[])
 {
     real loads[LOADS], t[N_A + POLICY_TARGET_N_P], v[N_V];
     int i, code;
     copy(loads, s->e + N_X, N_W);
-    copy(loads + N_W, level, N_D);
+    for (i = 0; i < N_D; i++) loads[N_W + i] = known[i] - NOMINAL[i];
     loads[LOADS - 1] = 1;
     copy(t, r, N_Y);
     copy(t + N_Y, loads, LOADS);
@@ -221,32 +245,33 @@ static int aim(policy_state *s, const real r[], const real level[])
     add(s->x_s, &X_L[0][0], N_X, LOADS, loads);
     add(s->u_s, &U_L[0][0], N_U, LOADS, loads);
     add(s->y_s, &Y_L[0][0], N_Y, LOADS, loads);
+    weigh(s, r);
     return code;
 }
 
 /* Replace the last input by the plan's; return a code. */
 static int plan(policy_state *s, const real known[])
 {
-    /* a stage of p has set-points and inputs relative to the target if it has any, then known ones */
-    enum { N_R = POLICY_N_R, N_UR = POLICY_N_UR, N_K = N_R + N_UR + N_D };
-    real level[POLICY_N_D_] = {0}, move[N_U], *p = s->p;
+    /* a stage of p has set-points and inputs relative to the last target if it has any, then known
+       signals */
+    enum { N_R = POLICY_N_R, N_UR = POLICY_N_UR, N_K = N_R + N_UR + N_D, LAST_ROW = STAGES - 1 };
+    const real *r = s->r, *last = known + LAST_ROW * N_D;
+    real move[N_U], *p = s->p;
     int i, k, code;
-    for (i = 0; i < N_D; i++) {
-        for (k = 0; k < STAGES; k++) level[i] += known[k * N_D + i] - NOMINAL[i];
-        level[i] /= (real)STAGES;
-    }
-    for (k = 0; k < SET_POINTS; k++) {
-        if ((code = aim(s, s->r + k * N_Y, level)) != POLICY_SOLVED) return code;
-        copy(p + k * N_K, s->y_s, N_R);
+    for (k = N_R || N_UR ? 0 : LAST_ROW; k < STAGES; k++) {
+        if (SET_POINTS > 1) r = s->r + k * N_Y;
+        if ((code = aim(s, r, known + k * N_D)) != POLICY_SOLVED) return code;
+        for (i = 0; i < N_R; i++) p[k * N_K + i] = s->aims[OF_R[i]];
         copy(p + k * N_K + N_R, s->u_s, N_UR);
     }
     for (k = 0; k < STAGES; k++) {
-        for (i = 0; i < N_R; i++) *p++ -= s->y_s[i];
+        for (i = 0; i < N_R; i++) *p++ -= s->y_s[OF_R[i]];
         for (i = 0; i < N_UR; i++) *p++ -= s->u_s[i];
-        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - NOMINAL[i] - ACTS[i] * level[i];
+        for (i = 0; i < N_D; i++) *p++ = known[k * N_D + i] - NOMINAL[i] - ACTS[i] * last[i];
     }
     for (i = 0; i < N_X; i++) *p++ = s->e[i] - s->x_s[i];
     for (i = 0; i < POLICY_MOVES; i++) *p++ = s->u[i] - s->u_s[i];
+    for (i = 0; i < POLICY_OFF; i++) *p++ = s->y_s[OF_R[i]] - s->aims[OF_R[i]];
     for (i = 0; i < POLICY_BOUNDED_Y; i++) *p++ = s->y_s[OF_Y[i]];
     for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
     *p = 1;

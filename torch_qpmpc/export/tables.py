@@ -68,7 +68,7 @@ class Tables:
 
     Attributes:
         n_p, n_u: the numbers of known entries and of actions.
-        rows: the rows that v changes, scaled to Q_ii = 1.
+        rows, places: the rows that v changes, scaled to Q_ii = 1, and their places in G.
         known: the rows that p alone determines.
         Q: ``(r, r)``.
         R: ``(r, d)`` with Q = R R', where d is the size of v.
@@ -87,6 +87,7 @@ class Tables:
     n_p: int
     n_u: int
     rows: Rows
+    places: Array
     known: Rows
     Q: Array
     R: Array
@@ -128,20 +129,14 @@ def make_tables(mpc: QPMPC) -> Tables:
     has_free = free > ROUNDING * sizes.max(-1, initial=0.0)
     units[:n_p] = 1.0
     of_C = np.where(has_free, free, np.maximum(np.abs(C * units).max(-1, initial=0.0), TINY))
-    original, H, q, C, b, G = (
-        G,
-        H * np.outer(units, units),
-        q * units,
-        C * units,
-        b / of_C,
-        G * units,
-    )
-    C = C / of_C[:, None]
+    original, G, C = G, G * units, C * units / of_C[:, None]
+    H, q, b = H * np.outer(units, units), q * units, b / of_C
 
     # z = T_p p + T_v v + z_b, with an orthonormal basis of v.
     elimination = null_space(C[None], n_p)
     T, Y_neg = elimination.T[0], elimination.Y_neg[0]
     T_p, T_v, z_b = T[:, :n_p], T[:, n_p:], -Y_neg @ b
+    T_v[np.abs(T_v).max(-1, initial=0.0) < ENTERS] = 0.0  # of states that nothing moves
     factor, condition = _factor(T_v.T @ H @ T_v)
 
     # The minimiser without inequalities, z = Z p + z_0.
@@ -172,6 +167,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         n_p,
         n_u,
         rows,
+        on_plan,
         known,
         R @ R.T,
         R,

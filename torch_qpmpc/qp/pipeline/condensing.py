@@ -148,6 +148,7 @@ class Sensitivities(NamedTuple):
 def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
     """Condense M matrix triples, keeping the first ``n_kept`` entries of z."""
     T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
+    T[:, :, n_kept:][np.abs(T[:, :, n_kept:]).max(-1, initial=0.0) < ENTERS] = 0.0  # rounding
     H_T = _products(theta.H, T)
     H = T.swapaxes(1, 2) @ H_T
     H = (H + H.swapaxes(1, 2)) / 2
@@ -297,8 +298,7 @@ def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | Non
     n_c, n_z = C.shape
     # The rows of W stand for C z - b = 0, which is not solved for the first n_kept entries of z.
     W = np.concatenate((C, -np.eye(n_c)), axis=1)
-    nonzero = C != 0
-    first = np.where(nonzero.any(0), nonzero.argmax(0), -1)
+    first = np.where(C.any(0), (C != 0).argmax(0), -1)
     first[:n_kept] = -1
     pivots = []
     for k in range(n_c):

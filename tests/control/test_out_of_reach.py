@@ -1,0 +1,174 @@
+"""Set-points that bounds put out of reach, and forecasts that are not constant, beside own QPs.
+
+The reference minimises the cost of `LinearMPC`'s docstring over a long horizon, without targets: by
+Wright's turnpike its first input is that of an endless loop, whose slope the terminal cost has.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import qpsolvers
+
+import torch_qpmpc as qm
+from tests.control.controllers import exported
+
+#: Stages of the reference, which sees far past the controller's.
+LONG = 60
+A = np.array([[0.9, 0.05, 0.0], [0.0, 0.8, 0.1], [0.05, 0.0, 0.85]])
+B = np.array([[0.3, 0.0], [0.1, 0.4], [0.0, 0.1]])
+C = np.array([[1.0, 0.0, 0.2], [0.0, 1.0, 0.5]])
+E = np.array([[0.1], [0.0], [0.3]])
+DESIGN: dict[str, Any] = {"Q": [2.0, 1.0], "dR": [0.3, 0.1], "u_bounds": (-1.0, 1.0)}
+
+
+def made(horizon: int = 10, **options: Any) -> qm.Controller:
+    mpc = qm.LinearMPC((A, B, C), horizon, E=E, known=["d"], **DESIGN | options)
+    return qm.Controller(mpc, noise=0.02)
+
+
+def best(x: np.ndarray, u_last: np.ndarray, r: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the first input of the cost's optimum over as many stages as r has rows."""
+    N, powers = len(r), [np.linalg.matrix_power(A, k) for k in range(len(r) + 1)]
+    zero, free = np.zeros((2, 2)), [x]
+    for load in d[: N - 1]:
+        free.append(A @ free[-1] + E @ load)
+    response = [[C @ powers[k - j - 1] @ B if j < k else zero for j in range(N)] for k in range(N)]
+    G, D = np.block(response), np.eye(2 * N) - np.eye(2 * N, k=-2)
+    Q, dR = (np.tile(weight, N) for weight in (DESIGN["Q"], DESIGN["dR"]))
+    off = (np.array(free) @ C.T - r).ravel()
+    before = np.r_[u_last, np.zeros(2 * N - 2)]
+    P = 2 * (G.T * Q @ G + D.T * dR @ D)
+    q = 2 * (G.T * Q @ off - D.T * dR @ before)
+    ones = np.ones(2 * N)
+    u = qpsolvers.solve_qp((P + P.T) / 2, q, lb=-ones, ub=ones, solver="quadprog")
+    assert u is not None
+    return u[:2]
+
+
+def estimated(controller: qm.Controller, d: float) -> np.ndarray:
+    """Return the state that the last step's plan began with, from the prediction after it."""
+    observer, e = controller.observer, controller._memory.e
+    assert e is not None
+    still = observer.predicted(np.zeros_like(e), controller.u, np.array([d]))
+    return np.linalg.solve(observer.F, e - still)[: len(A)]
+
+
+@pytest.mark.parametrize("r", [[9.0, -1.0], [1.0, 6.0], [-8.0, 8.0], [0.5, 0.3]])
+def test_a_plan_is_the_optimum_of_an_endless_loop(r):
+    """The filter's estimates are off in a noisy loop; both plan from them."""
+    rng, x, controller, differences = np.random.default_rng(0), np.zeros(3), made(25), []
+    controller.reset(y=[0.0, 0.0], u=[0.0, 0.0], known=[0.0])
+    ahead = np.tile(r, (LONG, 1)), np.full((LONG, 1), 0.2)
+    for k in range(12):
+        u_last = controller.u
+        u = controller.step(C @ x + 0.02 * rng.normal(size=2), r, known=[0.2])
+        if k % 4 == 3:
+            w = controller.w @ np.linalg.pinv(controller.mpc.design.disturbances.C).T
+            own = best(estimated(controller, 0.2), u_last, ahead[0] - w, ahead[1])
+            differences.append(np.abs(u - own).max())
+        x = A @ x + B @ u + E @ [0.2]
+    assert max(differences) < 1e-3
+
+
+def test_a_horizon_decides_little_about_a_set_point_out_of_reach():
+    """The terminal slope stands for what comes after the plan."""
+    loops = []
+    for horizon in (3, 40):
+        run = made(horizon).simulate(steps=120, r=[1.5, 6.0], known=[0.1], u=[0.0, 0.0])
+        loops.append(run)
+    short, long = loops
+    assert np.abs(short.y[-1] - long.y[-1]).max() < 1e-6, "they rest at the same outputs"
+    assert short.cost.sum() < 1.02 * long.cost.sum()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_forecast_is_paid_for_when_it_comes(seed):
+    """A load for later may be out of reach: now the set-point is held, as by an own QP."""
+    rng, x = np.random.default_rng(seed), np.zeros(3)
+    d = np.r_[np.zeros(8), np.full(6, rng.uniform(3, 9)), np.zeros(LONG)][:, None]
+    controller, r, held = made(24), np.tile([0.4, 0.2], (LONG, 1)), np.arange(LONG).clip(max=24)
+    controller.reset(y=[0.0, 0.0], u=[0.0, 0.0], known=[0.0])
+    for k in range(6):
+        u_last, stages = controller.u, d[k : k + 25]
+        u = controller.step(C @ x, r[0], known=stages)
+        w = controller.w @ np.linalg.pinv(controller.mpc.design.disturbances.C).T
+        own = best(estimated(controller, d[k, 0]), u_last, r - w, stages[held])
+        assert np.abs(u - own).max() < 1e-3
+        x = A @ x + B @ u + E @ d[k]
+
+
+def test_inputs_with_a_weight_are_held_about_the_target_of_their_stage():
+    """R about the target of the forecast's mean moved the outputs off a set-point within reach."""
+    controller, x = made(20, R=[0.5, 0.5]), np.zeros(3)
+    assert controller.mpc.design.staged
+    d = 0.5 * np.sin(np.arange(200) / 15)[:, None]
+    for k in range(120):
+        u = controller.step(C @ x, [0.3, 0.2], known=d[k : k + 21])
+        x = A @ x + B @ u + E @ d[k]
+    assert controller.target is not None
+    assert controller.target.u.shape == (21, 2)
+    assert np.abs(C @ x - [0.3, 0.2]).max() < 0.02
+
+
+@pytest.mark.parametrize("options", [{}, {"R": (0.5, 0.1)}, {"references": "preview"}])
+def test_c_plans_for_the_same_set_points(options):
+    controller, twin = exported(made, **options)
+    rng, x, rows = np.random.default_rng(1), np.zeros(3), 11 if "references" in options else 1
+    levels = rng.normal(size=(8, 2)) * [6.0, 4.0]
+    d = rng.normal(size=(8, 1)).repeat(9, 0)
+    for k in range(50):
+        r = np.tile(levels[k // 8], (rows, 1))
+        ahead, y = d[k : k + 11], C @ x + 0.02 * rng.normal(size=2)
+        u = controller.step(y, r, known=ahead)
+        v, code = twin.step(y, r, ahead)
+        assert code == controller.status == 0
+        assert np.abs(u - v).max() < 1e-8
+        x = A @ x + B @ u + E @ d[k]
+
+
+# Bounds of outputs
+
+
+def coupled(horizon: int = 8, **options: Any) -> qm.Controller:
+    """Return the controller of y1 whose input moves y2 through three lags, in a zone."""
+    A = np.diag([0.8, 0.7, 0.7, 0.7]) + np.diag([0.0, 0.3, 0.3], 1)
+    B, C = [[0.2], [0.0], [0.0], [0.3]], np.eye(2, 4)
+    zone: dict[str, Any] = {"Q": {"y1": 1.0}, "dR": 0.1, "y_bounds": {"y2": (-0.5, 0.5)}}
+    return qm.Controller(qm.LinearMPC((A, B, C), horizon, **zone | options))
+
+
+@pytest.mark.parametrize("horizon", [3, 8])
+@pytest.mark.parametrize("bounds", [(-5.0, 50.0), (-1.0, 0.2)])
+def test_a_plan_rests_where_a_zone_or_the_input_stops_it(horizon, bounds):
+    """Bounds after the horizon do not act: with r itself plans ended outside the zone."""
+    run = coupled(horizon, u_bounds=bounds).simulate(steps=150, r=[2.0, 0.0], u=[0.0])
+    assert np.allclose(run.y[-1], min(0.5, bounds[1]), atol=1e-6)
+    assert run.y[:, 1].max() < 0.5 + 1e-6
+
+
+def test_a_set_point_is_weighed_but_for_what_bounds_of_outputs_hold_off():
+    mpc = coupled(u_bounds=(-1.0, 1.0)).mpc
+    held, pushed, free = mpc.target([[2.0, 0.0], [-3.0, 0.0], [0.3, 0.0]]).r[:, 0]
+    assert np.allclose([held, pushed, free], [0.5, -0.5, 0.3], atol=1e-7)
+    narrow = coupled(u_bounds=(-0.1, 0.1)).mpc
+    assert np.allclose(narrow.target([2.0, 0.0]).r[0], 2.0), "the input's bound alone"
+    hot = coupled(u_bounds=(-1.0, 1.0), y_bounds={"y2": (2.0, 3.0)}).mpc.target([-3.0, 0.0])
+    assert np.allclose([hot.y[0], hot.r[0]], 1.0), "the zone pulls the other way"
+    own = coupled(u_bounds=(-1.0, 1.0), y_bounds={"y1": (2.0, 3.0)}).mpc.target([2.5, 0.0])
+    assert np.allclose([own.y[0], own.r[0]], [1.0, 2.5]), "both pull the same way"
+
+
+def test_c_weighs_the_same_set_points_beside_zones():
+    controller, twin = exported(coupled, u_bounds=(-1.0, 0.8))
+    rng, x = np.random.default_rng(2), np.zeros(4)
+    plant, levels = controller.mpc.design.plant, rng.uniform(-2, 2, 8)
+    for k in range(64):
+        y, r = plant.C @ x + 0.01 * rng.normal(size=2), np.array([levels[k // 8], 0.0])
+        u = controller.step(y, r)
+        v, code = twin.step(y, r[None])
+        assert code == controller.status == 0
+        assert np.abs(u - v).max() < 1e-8
+        x = plant.A @ x + plant.B @ u + [0.0, 0.05, 0.0, 0.0]
