@@ -1,7 +1,8 @@
 """How far a call travels through the package's files: ``python -m tests.benchmarks.stays``.
 
 A *stay* is a run of calls in one file, and a *return* a stay in a file that was left before. Traced
-is the second V of one state for each solver; a reader of the call changes page as often.
+is the second V of one state for each solver, and a step of a controller; a reader of the call
+changes page as often.
 """
 
 from __future__ import annotations
@@ -58,6 +59,15 @@ def of_value(solver: str) -> Journey:
     return traced(lambda: mpc.value(s))
 
 
+def of_step() -> Journey:
+    """Trace a step of a controller."""
+    model = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], [[1.0, 0.0]]
+    controller = qm.Controller(qm.LinearMPC(model, 10, Q=[1.0], dR=[0.1], u_bounds=(-1.0, 1.0)))
+    controller.step([0.1], [0.5])
+    return traced(lambda: controller.step([0.1], [0.5]))
+
+
 if __name__ == "__main__":
-    rows = [[name, *map(str, of_value(name))] for name in BACKENDS]
-    print(table(["V", "stays", "returns", "files"], rows))
+    journeys = {f"V, {name}": of_value(name) for name in BACKENDS} | {"step": of_step()}
+    rows = [[name, *map(str, journey)] for name, journey in journeys.items()]
+    print(table(["", "stays", "returns", "files"], rows))
