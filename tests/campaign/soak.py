@@ -94,7 +94,7 @@ def run(made: Mapping[str, Callable[[], qm.LinearMPC]], steps: int) -> dict[str,
     for i, (name, make) in enumerate(made.items()):
         controller = qm.Controller(make())
         with tempfile.TemporaryDirectory() as folder:
-            twin = load(controller.export_c(folder).files, controller)
+            twin = load(controller.export_c(folder, missing=True).files, controller)
         differences[name], counts = soak(controller, twin, -(-steps // len(made)), 10, i)
         print(f"{name}: inputs within {differences[name]:.1e}; {dict(counts)}", flush=True)
     return differences
