@@ -39,7 +39,7 @@ FEW, MANY = 5, 20
 #: states of their own.
 HIDDEN = 1e-2
 #: Candidates, as far as the data allow; 0 states are the outputs alone.
-ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20), (5, 10, 20, 40)
+ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20), (2, 5, 10, 20, 40)
 #: Cross-validation leaves out every PARTS-th block of a log. Longer trajectories are cut into
 #: blocks of LONG steps, or fewer so that there are BLOCKS, but no shorter than SHORT.
 PARTS, BLOCKS, LONG, SHORT = 4, 12, 200, 10
@@ -58,8 +58,8 @@ WORST = 1e6
 #: Outputs may be unmoved if they are constant in this share of the steps; the number of past inputs
 #: in the test, and its level.
 CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
-#: So many orders, whose starts have the least errors, are compared by their likeliest models, and
-#: more if the rows of these are no more than ROWS.
+#: So many orders, whose starts have the least errors, are compared by their likeliest models; more,
+#: then with other lags, while the rows of their logs together are at most ROWS.
 REFINED, ROWS = 2, 10_000
 #: Autocorrelations of the residuals in the test of whiteness.
 CORRELATIONS = 20
@@ -276,8 +276,9 @@ def _compare(
                     pars[n, p] = [_states(start, n) for start in starts]
     if pars:
         rows = judged({key: [*map(steady, x)] for key, x in pars.items()})
-        best = {row.order: row for row in sorted(rows, key=lambda row: -row.score)}
-        few = sorted(best.values(), key=lambda row: row.score)
+        rows.sort(key=lambda row: row.score)
+        best = {row.order: row for row in reversed(rows)}.values()
+        few = list(dict.fromkeys([*sorted(best, key=lambda row: row.score), *rows]))
         few = few[: max(REFINED, ROWS // sum(one.steps for one in trajectories))]
         few.append(min(equal_candidates(rows), key=lambda row: (row.order, row.score)))
         found = found if len(orders) > 1 else {}
