@@ -139,13 +139,11 @@ def main() -> None:
         orders, own, lags, other = zip(*rows, strict=True)
         errors = [float(np.exp(np.mean(np.log(x)))) for x in (own, other)]
         ratios.append(errors[0] / errors[1])
-        counts = [", ".join(map(str, x)) for x in (orders, lags)]
-        lines.append([name, f"{len(u)}", f"{y.shape[1]} x {u.shape[1]}"])
-        lines[-1] += [counts[0], f"{errors[0]:.3f}", counts[1], f"{errors[1]:.3f}"]
-        lines[-1].append(f"{ratios[-1]:.2f}")
-        print(*lines[-1], f"{time.process_time() - start:.1f} s", sep="  ", flush=True)
+        lines.append([name, *(f"{x:.3f}" for x in errors), f"{ratios[-1]:.2f}"])
+        sizes = f"{len(u)} rows, {y.shape[1]} x {u.shape[1]}, orders {orders}, lags {lags}"
+        print(*lines[-1], sizes, f"{time.process_time() - start:.1f} s", sep="  ", flush=True)
     print(f"median {np.median(ratios):.2f}, largest {max(ratios):.2f}")
-    head = ["", "rows", "size", "orders", "`identify`", "ARX lags", "ARX", "ratio"]
+    head = ["", "`identify`", "ARX", "ratio"]
     if options.write:
         page = PAGE.read_text(encoding="utf-8")
         PAGE.write_text(replaced(page, table(head, lines), "logs"), encoding="utf-8")
