@@ -398,7 +398,8 @@ class ControlledPlant(SimulatedPlant):
         """Return the states with the target and p of the next plan."""
         x, w = self._parts(base)[1].tensor_split([len(self._design.plant.A)], -1)
         known, staged = self._ahead(base, self._horizon), self._design.staged
-        ahead = [v[:, None].expand(-1, known.shape[1], -1) for v in (r, w)]
-        target = self._mpc.target(*ahead, known) if staged else self._mpc.target(r, w, known[:, -1])
+        aim, load = (v[:, None].expand(-1, known.shape[1], -1) for v in (r, w))
+        loads = (aim, load, known) if staged else (r, w, known[:, -1])
+        target = self._mpc.target(*loads)
         p = self._mpc.arrange(x, target, u_last=u_last, known=known)
         return torch.cat((base, u_last, r, target.u[:, -1] if staged else target.u, p), -1)

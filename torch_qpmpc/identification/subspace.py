@@ -139,7 +139,7 @@ def held_out_errors(
     total = np.full((*block.shape, trajectories[0].y.shape[1]), np.nan)
     for part, model in enumerate(parts):
         mask = (block >= 0) & (block % PARTS == part)
-        total[mask] = np.concatenate(_errors(model, trajectories, horizon))[mask]
+        total[mask] = np.concatenate([*_errors(model, trajectories, horizon)])[mask]
     return total
 
 

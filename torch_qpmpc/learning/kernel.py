@@ -109,7 +109,8 @@ class OuterProducts:
 
     def diagonal(self) -> Tensor:
         chi, z = self.rows * self.chi.square(), self.z.square() / self.columns
-        return self.scale * sum(chi[:, i].sum(-1) * z.sum(-1) for i in self.groups)
+        parts = [chi[:, i].sum(-1) * z.sum(-1) for i in self.groups]
+        return self.scale * torch.stack(parts).sum(0)
 
     def damp(self, mu: Tensor) -> Tensor:
         drifted = self.z.new_zeros(len(self.z))
