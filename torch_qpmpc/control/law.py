@@ -211,8 +211,7 @@ class Law:
         rows = np.hstack((np.broadcast_to(r, (len(known), len(design.Q))), known))
         for row in rows[0 if design.staged else -1 :]:
             if not aimed or (row != last).any():
-                aim, load = np.split(row, [len(design.Q)])
-                last, steady = row, self._aimed(aim, load, e[n:])
+                last, steady = row, self._aimed(row[: len(r.T)], row[len(r.T) :], e[n:])
             if steady is None:
                 return self._held(memory, e, Outcome.INFEASIBLE)
             aimed.append(steady)
