@@ -133,7 +133,7 @@ SHORT = {
         "--seeds 71", needs=("controlgym",)
     ),
     # The campaigns.
-    "python -m tests.campaign --count 100000 --solver daqp": Short(
+    "python -m tests.campaign --count 20000 --solver daqp": Short(
         "--count 40 --seed 71 --results counts"
     ),
     "python -m tests.campaign --solver 'daqp, warm'": Short(

@@ -356,18 +356,17 @@ class _Loops:
 
         Theta acts on the loops by their actions alone. The chain through the plant goes backwards
         in time and gives each action the slope of the mean cost in it; all QPs are differentiated
-        at once. Actions of the second half have no gradient, as most of what they cost comes after
-        the end: theta would learn to leave it there.
+        at once.
         """
         taken = self.run(mpc, steps)
         mean = taken.costs.mean()
         if not mean.isfinite():
             return mean
-        known, first = taken.known.requires_grad_(), steps - steps // 2
-        parts = zip(known.tensor_split([first]), taken.active.tensor_split([first]), strict=True)
-        actions, others = (mpc.policy(*part) for part in parts)
-        sums = torch.cat((actions, others)).sum((0, 1))
-        rows = (torch.autograd.grad(u, known, retain_graph=True)[0] for u in sums)
+        known = taken.known.requires_grad_()
+        actions = mpc.policy(known, taken.active)
+        rows = (
+            torch.autograd.grad(u.sum(), known, retain_graph=True)[0] for u in actions.unbind(-1)
+        )
         gains = torch.stack([*rows], -2)
         share = torch.full_like(taken.costs[0], 1 / taken.costs.numel())
         slope, slopes = torch.zeros_like(self._s), torch.empty_like(taken.actions)
@@ -379,7 +378,7 @@ class _Loops:
             )
             through = (slopes[k][:, None] @ gains[k])[:, 0]
             slope = direct + torch.autograd.grad(self._known(s), s, through)[0]
-        linear = (actions * slopes[:first]).sum()
+        linear = (actions * slopes).sum()
         return mean + (linear - linear.detach())
 
 
