@@ -140,7 +140,7 @@ SHORT = {
         "--count 40 --seed 71 --results counts"
     ),
     "python -m tests.campaign --solver --write": Short(),
-    "python -m tests.campaign --count 100000 --solver NAME": Short(
+    "python -m tests.campaign --count 20000 --solver NAME": Short(
         "--count 40 --seed 71 --solver torch --results counts"
     ),
     "python -m tests.campaign.numerics --write": Short("--solver daqp"),
