@@ -40,3 +40,9 @@ def test_an_action_without_any_cost_has_no_effect_on_it():
     p, c = affine_cost_to_go(0.5 * one, still, one[0], weight, zero, one * 8 / 7, 0.5)
     assert_close(p, torch.tensor([8 / 21]).double())
     assert_close(c, torch.tensor(4 / 7 + 8 / 21).double())
+
+
+def test_a_weight_may_be_asymmetric_by_rounding():
+    rounded = W.clone()
+    rounded[0, 1] += 1e-13
+    assert_close(riccati_weight(A, B, rounded), riccati_weight(A, B, W), atol=1e-11, rtol=0)

@@ -46,7 +46,7 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
     Without active bounds, an MPC scheme with H_f = P is that regulator, for any horizon. Arguments
     and errors are as in `lqr_gain`.
     """
-    n_x, root = A.shape[-1], gamma**0.5
+    n_x, root, W = A.shape[-1], gamma**0.5, (W + W.mT) / 2  # SciPy allows W no rounding
     Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
     try:
         P = scipy.linalg.solve_discrete_are(
