@@ -118,10 +118,8 @@ SHORT = {
     "python docs/examples/torchrl/ddpg.py": Short(instead=f'python -c "{SCRIPT}"'),
     # Benchmarks that can be shortened: one row of each.
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
-    "python -m tests.benchmarks.closed_loops --cases Gros-Zanon 'Heated tank, after learn' "
-    "--seeds 6 7 8 9 10": Short("--cases Gros-Zanon --seeds 71"),
-    "python -m tests.benchmarks.closed_loops --cases 'controlgym he2' --seeds 7 8 9 10 11": Short(
-        "--seeds 71", needs=("controlgym",)
+    "python -m tests.benchmarks.closed_loops --seeds 16 17 18 19 20": Short(
+        "--cases Gros-Zanon --seeds 71"
     ),
     "python -m tests.benchmarks.improvement": Short(
         "--cases 'Point mass, Brownian noise' --seeds 71"
@@ -148,7 +146,7 @@ SHORT = {
     "python -m tests.campaign.rounding": Short("--count 40 --controllers 1 --seed 71"),
     "python -m tests.campaign.export --count 100000 --write": Short("--count 20"),
     "python -m tests.campaign.units --compiled 200": Short("--count 2 --compiled 1 --first 71"),
-    "python -m tests.campaign.soak": Short("--steps 500"),
+    "python -m tests.campaign.soak": Short("--steps 5000"),
     "python -m tests.faults.kill --count 20": Short("--count 1 --seed 71"),
     "python -m tests.faults.long": Short("--updates 20 seed=71"),
     "python -m tests.claims --quick": Short("--only soak"),

@@ -15,6 +15,7 @@ from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.learning.closed_loop import (
+    SimulatedPlant,
     _Loops,
     ensemble,
     growth,
@@ -132,6 +133,19 @@ def test_half_of_the_models_trains_and_the_other_half_decides(found):
     assert report.gained == 1
     assert report.interval[1] < 0
     assert all(torch.equal(before[name], x) for name, x in mpc.state_dict().items())
+
+
+def test_loops_that_no_action_holds_fail_and_decide_nothing(found):
+    """They end as NaN, soon, in place of numbers without end; both thetas fail alike."""
+    mpc, log = controller(found, on_failure="mask"), found.log.trajectories
+    model = found.model._replace(A=1.4 * found.model.A)
+    plant = SimulatedPlant([model], model, log, stage_cost(mpc.scheme), 5)
+    taken = _Loops(plant, 16, 0).run(mpc, 80)
+    assert taken.costs[-1].isnan().sum() > 8
+    assert taken.states.nan_to_num().abs().max() < 1e9
+    report = qm.improve(mpc, plant, updates=2, loops=4, steps=20, held_out=16)
+    assert not report.kept
+    assert (report.gained, report.after) == (0, np.inf)
 
 
 @pytest.mark.parametrize("seed", range(3))

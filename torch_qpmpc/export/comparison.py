@@ -13,7 +13,7 @@ import torch
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.library import Library
-from torch_qpmpc.export.tables import FAR, TINY, Array, Tables
+from torch_qpmpc.export.tables import TINY, Array, Tables, far
 from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
@@ -116,12 +116,11 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
     Y, lower, upper, *_ = (np.concatenate(pair) for pair in pairs)
-    ends = np.abs(np.stack((lower, upper)) - Y @ tables.centre)
-    ends[ends > FAR * np.where(ends.min(0) > 0, ends.min(0), np.inf)] = np.inf
-    span = np.where(np.isfinite(ends).all(0), upper - lower, 0.0)  # a centre may be at a bound
-    near = np.where(ends > CENTRED * span, ends, np.inf).min(0)
-    reach = near / np.abs(Y).max(1, initial=TINY)
-    near[reach > FAR * reach.min(initial=np.inf)] = np.inf
+    reach = np.abs(np.stack((lower, upper))) / np.abs(Y).max(1, initial=TINY)
+    acts = ~far(reach, np.isfinite(reach) & (reach > 0))
+    span = np.where(np.isfinite(reach).all(0) & acts.all(0), upper - lower, 0.0)
+    ends = np.where(acts, np.abs(np.stack((lower, upper)) - Y @ tables.centre), np.inf)
+    near = np.where(ends > CENTRED * span, ends, np.inf).min(0)  # a centre may be at a bound
     quantiles = rng.uniform(0, 0.5, count)
     scale = np.tile(np.ones(tables.n_p) if len(Y) else tables.usual, (count, 1))
     rounding = 1e-13 * np.abs(Y).max(initial=0)  # of entries without an effect

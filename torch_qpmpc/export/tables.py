@@ -250,7 +250,7 @@ def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Arra
     C, b, G, lb, ub, w = (getattr(qp, name).detach().double().cpu() for name in names)
     half = (ub - lb) / 2
     rows = half.isfinite() & (half > 0) & (w > 0)
-    rows &= half <= FAR * half[rows].min() if rows.any() else rows
+    rows &= ~torch.from_numpy(far(half.numpy(), rows.numpy()))
     weighted = G[rows] / half[rows, None].square()
     H = weighted.mT @ G[rows]
     H = H + CENTRED * max(float(H.diagonal().mean()), 1.0) * torch.eye(len(H)).to(H)
@@ -261,6 +261,11 @@ def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Arra
     p = z[:n_p].numpy()
     p[[*constants]] = [*constants.values()]
     return p
+
+
+def far(sizes: Array, of: Array) -> Array:
+    """Return the mask of sizes of bounds that cannot act beside the small ones among ``of``."""
+    return sizes > FAR * (np.quantile(sizes[of], 0.1) if of.any() else np.inf)
 
 
 def digest(qp: QuadraticProgram) -> str:

@@ -45,6 +45,8 @@ MEMBERS = 8
 PIECE = 4
 #: Loops that decide are this many times as long as those of the gradients.
 LONGER = 4
+#: A loop that sees signals this many times as large as the first ones has failed.
+LOST = 1e6
 
 
 class SimulatedPlant:
@@ -335,6 +337,7 @@ class _Loops:
         if seed is not None:
             self._rng.manual_seed(seed)
         self._s, self.done = self._plant.starts(self._rng, self._count), 0
+        self._far = LOST * max(self._known(self._s).abs().max().item(), 1.0)
         self._nu = torch.zeros_like(self._s)
 
     @torch.no_grad()
@@ -345,6 +348,7 @@ class _Loops:
         for _ in range(steps):
             p = self._known(s)
             a, active = mpc.policy_and_active_set(p, active, qp)
+            a = torch.where((p.abs() > self._far).any(-1, keepdim=True), torch.nan, a)
             self._nu = plant.noise(self._nu, plant.draw(self._rng, self._count))
             done.append(_Steps(s, p, a, active, self._nu, plant.cost(s, a)))
             s = plant.step(s, a, self._nu)
@@ -441,7 +445,8 @@ def improve(
     theta is kept if `PairedTest` finds that it costs less in unseen loops of four times the
     ``steps``, and with no model clearly more; otherwise ``mpc`` stays as it was. One half of an
     identified plant's models trains theta, and the other one decides. A loop in which a QP has no
-    certified solution costs infinity, and an update with such a loop is skipped.
+    certified solution, or whose signals grow a million times, costs infinity; an update with such a
+    loop is skipped.
 
     Args:
         mpc: the policy, with ``learn`` and ``structure`` of its own.
@@ -511,16 +516,16 @@ def improve(
     finally:
         mpc.on_failure = on_failure
         mpc.zero_grad()
-    difference = torch.where(old.isfinite(), new - old, -torch.inf)
-    difference = difference.where(new.isfinite(), torch.inf)
+    old, new = (x.nan_to_num(torch.inf, torch.inf) for x in (old, new))
+    difference = (new - old).nan_to_num(0.0, torch.inf, -torch.inf)  # where both fail they tie
     test, members = PairedTest(), getattr(unseen, "members", 1)
     test.add(difference)
     parts = [difference[i::members] for i in range(members)]
     kept = test.decision == "better" and not any(map(_clearly_worse, parts))
     if not kept:
         mpc.load_state_dict(before)
-    means, gained = (old.mean().item(), new.mean().item()), sum(bool(x.mean() < 0) for x in parts)
-    return Improvement(kept, *means, test.interval, held_out, longer, curve, gained, members)
+    ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
+    return Improvement(kept, *ends, sum(bool(x.mean() < 0) for x in parts), members)
 
 
 def _clearly_worse(difference: Tensor) -> bool:
