@@ -48,7 +48,7 @@ class Watch:
         if len(self.memory) % 10 == 1:
             print(f"{len(self.memory) - 1:3} %: {self.memory[-1]:.1f} MB", flush=True)
 
-    def set_postfix(self, **_: float) -> None:
+    def set_postfix(self, *_: object, **__: object) -> None:
         """Show nothing."""
 
 
