@@ -31,7 +31,7 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 BUDGET = {
     ".": 410,
     "analysis": 851,
-    "control": 4773,
+    "control": 4746,
     "envs": 1440,
     "experiment": 2985,
     "export": 1456,

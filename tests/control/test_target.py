@@ -50,6 +50,30 @@ def test_inputs_that_the_set_point_leaves_free_are_least(seed):
         assert np.abs(target.u.numpy() - u).max() < 1e-5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_zones_hold_the_outputs_that_free_inputs_move(seed):
+    """The set-point and the price of a zone's violation decide, and no preference of inputs."""
+    rng = np.random.default_rng(seed)
+    A, B, C = np.diag(rng.uniform(-0.3, 0.9, 3)), rng.normal(size=(3, 3)), rng.normal(size=(3, 3))
+    half, price, Q = rng.uniform(0.1, 2), rng.uniform(5, 50), np.diag([1.0, 0.0, 0.0])
+    zones = {"y_bounds": ([-np.inf, -half, -half], [np.inf, half, half]), "y_slack": price}
+    mpc = qm.LinearMPC((A, B, C), 2, Q=Q, R=0.1, u_bounds=(-1.0, 1.0), **zones)
+    gain, n = C @ np.linalg.solve(np.eye(3) - A, B), mpc.anchors
+    assert n == 2
+    # The entries are u and the zones' violations.
+    rows = np.block([[gain[1:], -np.eye(2)], [-gain[1:], -np.eye(2)]])
+    P = np.pad(2 * gain.T @ Q @ gain, (0, 2)) + 1e-9 * np.eye(5)
+    limits = {"lb": np.append(-np.ones(3), [0.0, 0.0]), "ub": np.append(np.ones(3), [9e9, 9e9])}
+    for size in (0.3, 1.0, 4.0):
+        r = size * rng.normal(size=3)
+        q = np.append(-2 * gain.T @ Q @ r, [price, price])
+        z = qpsolvers.solve_qp(P, q, rows, np.full(4, half), **limits, solver="quadprog")
+        assert z is not None
+        y = mpc.target(r).y.numpy()
+        assert abs(y[0] - gain[0] @ z[:3]) < 1e-6
+        assert abs((np.abs(y[1:]) - half).clip(0).sum() - z[3:].sum()) < 1e-6
+
+
 def test_many_inputs_of_one_output_have_bounds_of_its_own():
     """The gains of 24 inputs within 1 add up to the output that they can hold."""
     B = np.random.default_rng(0).uniform(0.1, 1, (1, 24))

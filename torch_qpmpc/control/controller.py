@@ -357,7 +357,7 @@ class Controller:
 
         They cover the cost, the terminal weight, the horizon, the disturbances, hard bounds that
         can leave no plan, the reach of set-points, the loop without active bounds (its stability,
-        margin, offset and cost under the log's noise), and the C code.
+        margin, offset and cost under the log's noise).
 
         Args:
             r: set-points that the inputs must reach, by default the last step's.
@@ -406,8 +406,7 @@ class Controller:
             Sizes and the measured agreement.
 
         Raises:
-            QPError: as in `export_c`; the self-test fails; or inputs that r leaves free move
-                a bounded output without a weight, as their choice is not exact in C.
+            QPError: as in `export_c`, or the self-test fails.
         """
         return export_controller(self._law.renewed(), self._memory, folder, name=name, **options)
 

@@ -16,6 +16,7 @@ import numpy as np
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
+from torch_qpmpc.control.lowering import ROUNDS, STAYS
 from torch_qpmpc.control.observer import STEADY
 from torch_qpmpc.control.simulation import at_rest, centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
@@ -30,8 +31,6 @@ from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
 COMPARED, REPLAYED = 200, 10
 #: Largest difference of an input in the comparison, relative to half the distance of its bounds.
 NEAR = {"float64": 1e-6, "float32": 1e-2}
-#: The remedy for outputs that are `undetermined`.
-WEIGHT = "Give {} a small weight, or no bounds."
 SIZE = """#include "policy.h"
 unsigned long policy_state_size(void) { return sizeof(policy_state); }
 """
@@ -154,10 +153,6 @@ def export_controller(
     check_name(name)
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
     mpc, known = law.mpc, last_known(law.design, memory)
-    if names := undetermined(mpc):
-        got = f"bounds of {names}, which inputs move that no output with a weight tells apart"
-        want = "bounds that the set-point determines"
-        raise QPError.expected("controller", got, want, WEIGHT.format(names))
     with tempfile.TemporaryDirectory() as temporary:
         plan = export_c(mpc.plan, temporary, name=f"{name}_plan", **options)
         target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
@@ -234,18 +229,6 @@ def _variables(law: Law, memory: Memory) -> list[Variable]:
     manual = False, "take note of the applied inputs, in place of a step"
     variables.append(Variable("manual", "input", *manual))
     return [*variables, Variable("rests", "parameter", *rests)]
-
-
-def undetermined(mpc: LinearMPC) -> str:
-    """Return the names of outputs with bounds that inputs move which the set-points leave free.
-
-    The choice of these inputs is not exact in C.
-    """
-    steady = mpc.design.steady
-    if not (len(steady.W) and steady.n_a and mpc.free is None):
-        return ""  # else 1 / PREFERENCE is the QP's condition
-    moved = steady.Y[:, steady.n_a :].any(-1)
-    return ", ".join(np.array(mpc.design.plant.outputs)[moved & mpc.design.bounded[0]])
 
 
 def _course(law: Law, known: Array) -> dict[str, Any]:
@@ -349,14 +332,16 @@ def _signals(plant: StateSpace, name: str) -> list[str]:
 
 
 def _sizes(law: Law) -> dict[str, int]:
-    design, observer, free = law.design, law.observer, law.mpc.free
+    design, observer = law.design, law.observer
     n, m, n_y, n_d = design.plant.sizes
     width = {key: place.stop - place.start for key, place in design.places.items()}
     stages = design.horizon + 1
     return {
         "N_X": n,
         "N_W": len(observer.F) - n,
-        "N_F": 0 if free is None else free.n_u,
+        "FREE": int(law.mpc.free is not None),
+        "N_F": law.mpc.anchors,
+        "ROUNDS": ROUNDS,
         "N_E": len(observer.F),
         "N_U": m,
         "N_Y": n_y,
@@ -368,6 +353,7 @@ def _sizes(law: Law) -> dict[str, int]:
         "N_R": width["r"],
         "N_UR": width["u_r"],
         "OFF": width["off"],
+        "WEIGHTED": len(design.weighted),
         "PULLS": int(design.pulls[1].size > 0),
         "MOVES": width["u_last"],
         "BOUNDED_Y": width["y_s"],
@@ -396,6 +382,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(law.mpc, dtype), strict=True)),
         **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
         "MOST_U": law.max_plausible_u,
+        "STAYS": np.array([max(STAYS, 100 * np.finfo(dtype).eps)]),
     }
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torch_qpmpc.control.design import Design, largest
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.lowering import ROUNDS, stays
 from torch_qpmpc.control.observer import (
     ABSURD,
     SMALL,
@@ -202,7 +203,7 @@ class Law:
         It raises for no value of them, so that the estimates go on.
         """
         design, (memory, e, status) = self.design, self._seen(memory, y, known)
-        if valid := self._are_plausible(r, 0).all():
+        if valid := self._are_plausible(r, 0)[:, design.weighted].all():
             memory = memory._replace(r=r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
@@ -287,18 +288,25 @@ class Law:
 
     def _aimed(self, r: Array, d: Array, w: Array) -> list[Array] | None:
         """Return the parts of `LinearMPC.target` of a set-point; None if a QP has no solution."""
-        loads, v, known = np.concatenate((w, d - self.design.nominal, [1.0])), np.zeros(0), r
-        multipliers = []
-        for aims in self.aims:
-            state = np.concatenate((known, loads))
+        loads, n_f = np.concatenate((w, d - self.design.nominal, [1.0])), self.mpc.anchors
+        v, lam, f = np.zeros(0), np.zeros(0), np.zeros(n_f)
+        for _ in range(ROUNDS):
+            state = np.concatenate((f, r, loads))
+            solution = self.aims[0].solve(state[None])
+            if solution.status[0]:
+                return None
+            v, lam = solution.z[0, len(state) : -len(state)], solution.lam[0]
+            last, f = f, v[len(v) - n_f :]
+            if stays(f, last):
+                break
+        for aims in self.aims[1:]:
+            state = np.concatenate((v[: len(v) - n_f], loads))
             solution = aims.solve(state[None])
             if solution.status[0]:
                 return None
-            known = solution.z[0, len(state) : -len(state)]
-            v = np.concatenate((v, known))
-            multipliers.append(solution.lam[0])
+            v = np.concatenate((v[: len(v) - n_f], solution.z[0, len(state) : -len(state)]))
         x, u, y = (Z @ v + M @ loads for Z, M in self.design.steady.maps)
-        return [x, u, y, self.design.weighed(np, r, y, multipliers[0])]
+        return [x, u, y, self.design.weighed(np, r, y, lam)]
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.
@@ -392,6 +400,8 @@ class Law:
     def read_set_points(self, r: Any, rows: int, last: Array, sane: bool = True) -> Array:
         """Return set-points ``(rows, n_y)``, by default the ``last`` ones.
 
+        Of outputs without a weight, which need none, they are zero if left out or implausible.
+
         Raises:
             QPError: they are None in the first step, or invalid; see `read`.
         """
@@ -401,7 +411,12 @@ class Law:
             raise QPError.expected("r", "None in the first step", want)
         if r is None:
             r = last if len(last) else np.zeros(len(outputs))
-        return self.read("r", r, rows, sane=sane)
+        free = np.setdiff1d(np.arange(len(outputs)), self.design.weighted)
+        if isinstance(r, Mapping):
+            r = {**dict.fromkeys([outputs[i] for i in free], 0.0), **r}
+        table = self.read("r", r, rows, sane=sane)
+        table[:, free] = np.where(self._are_plausible(table, 0), table, 0.0)[:, free]
+        return table
 
     def read(self, name: str, value: Any, rows: int, least: int = 1, sane: bool = True) -> Array:
         """Return rows of y, r or known signals.

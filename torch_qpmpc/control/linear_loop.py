@@ -126,11 +126,10 @@ def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, 
     signals = torch.cat((torch.zeros_like(signals[:1]), signals))
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
     s = torch.cat((r, w, r.new_zeros(len(r), n_d), r.new_ones(len(r), 1)), -1)
-    a = s @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
-    # Without bounds the free inputs are least: f = 0.
-    f = a.new_zeros(len(a), design.steady.Y.shape[1] - a.shape[1])
+    state = torch.cat((s.new_zeros(len(s), mpc.anchors), s), -1)
+    v = state @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
     lam = s.new_zeros(len(s), len(mpc.targets.quadratic_program().lb))
-    aimed = mpc.steady_state(torch.cat((a, f), -1), s, lam)
+    aimed = mpc.steady_state(v, s, lam)
     stages = aimed
     if design.staged:
         stages = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))

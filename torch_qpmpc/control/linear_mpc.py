@@ -26,7 +26,7 @@ from torch_qpmpc.control.design import (
     within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import free_mpc, lowered, target_mpc
+from torch_qpmpc.control.lowering import ROUNDS, anchored, free_mpc, lowered, stays, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
@@ -105,8 +105,8 @@ class LinearMPC:
     Attributes:
         design: the `Design` of the arguments.
         plan: the `QPMPC` of the plan, with V, Q, the policy and what is learned.
-        targets: the QPMPC whose policy maps [r; w; d; 1] to the target; see
-            `torch_qpmpc.control.lowering`.
+        targets: the QPMPC whose policy maps [f_0; r; w; d; 1] to the target, and anchors: the
+            length of f_0; see `torch_qpmpc.control.lowering`.
         free: the one of the inputs that the target leaves free, None if there are none.
 
     Raises:
@@ -201,6 +201,7 @@ class LinearMPC:
         """Make the QPs; those of the target are not learned."""
         self.design, self.plan = design, QPMPC(lowered(design), **{**OPTIONS, **options})
         self.targets, self.free = target_mpc(design), free_mpc(design)
+        self.anchors = anchored(design)
         aims = [mpc for mpc in (self.targets, self.free) if mpc is not None]
         self._target_qps = [mpc.quadratic_program() for mpc in aims]
 
@@ -303,11 +304,17 @@ class LinearMPC:
         batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
         r, w, known = _expanded(parts, zip(sizes), batch)
         s = torch.cat((r, w, known - nominal, r.new_ones(*batch, 1)), -1)
-        solution = self.targets.solve(s, qp=self._target_qps[0])
-        v = self.targets.predicted(solution.z)[1][..., 0, :]
+        f = s.new_zeros(*batch, self.anchors)
+        for _ in range(ROUNDS):
+            solution = self.targets.solve(torch.cat((f, s), -1), qp=self._target_qps[0])
+            v = self.targets.predicted(solution.z)[1][..., 0, :]
+            last, f = f, v[..., v.shape[-1] - self.anchors :]
+            if stays(f, last):
+                break
         if self.free is not None:
-            state = torch.cat((v, s[..., len(self.design.Q) :]), -1)
-            v = torch.cat((v, self.free.policy(state, qp=self._target_qps[1])), -1)
+            a = v[..., : v.shape[-1] - self.anchors]
+            state = torch.cat((a, s[..., len(self.design.Q) :]), -1)
+            v = torch.cat((a, self.free.policy(state, qp=self._target_qps[1])), -1)
         return self.steady_state(v, s, solution.lam)
 
     def steady_state(self, v: Tensor, s: Tensor, lam: Tensor) -> Target:

@@ -17,16 +17,16 @@ where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known sig
 `torch_qpmpc.control.disturbance`). It is the policy of a one-stage `QPMPC` whose state, and p, is
 [r; w; d; 1] and whose action is v.
 
-Where several steady states have the same outputs with a weight, v = [a; f], the action is a,
-bounded so that an f exists. The policy of a second QPMPC with the state [a; w; d; 1] is f: least
-inputs within their bounds. One QP for both would need a weight of f so small that numbers in C lose
-their digits; it remains where f moves an output with soft bounds.
+Where several steady states have the same outputs with a weight, v = [a; f], the state is [f_0; r;
+w; d; 1], and f - f_0 has a weight. From f_0 = 0 the QP is solved again about its own f until that
+stays (the proximal point method, Rockafellar, SIAM J. Control Optim. 14, 1976): a weight so small
+that it moves no output off r would cost numbers in C their digits. Where f moves no output with
+bounds, it is then the policy of a second QPMPC with the state [a; w; d; 1]: least inputs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 SCALE = 1e-2
 #: An eigenvalue this near to the unit circle is on it.
 ON_CIRCLE = 1e-6
-#: The weight of small inputs among those with the same outputs, relative to the outputs'.
-PREFERENCE = 1e-8
+#: The weight of f - f_0 relative to the outputs'; the most rounds, and the f that stays.
+PREFERENCE, ROUNDS, STAYS = 1e-2, 50, 1e-10
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep, relative
 #: to the default one.
 HARD = 1e3
@@ -228,52 +228,51 @@ def _levels(design: Design, n_y: int) -> dict[str, Any]:
     return {"action_levels": levels, "level_rows": rows.tolist(), **switching}
 
 
-def is_split(design: Design) -> bool:
-    """Return True if f has a QP of its own."""
-    steady = design.steady
-    moved = steady.Y[:, steady.n_a :].any(-1)
-    return 0 < steady.n_a < steady.Y.shape[1] and not (moved & design.bounded[0]).any()
+def anchored(design: Design) -> int:
+    """Return the length of f_0: that of f if outputs have a weight."""
+    return len(design.steady.W) if design.steady.n_a else 0
+
+
+def stays(f: Any, last: Any) -> bool:
+    """Return True if the f of two rounds, in arrays or tensors, are the same."""
+    return bool((abs(f - last) <= STAYS * (1 + abs(f))).all())
 
 
 def target_mpc(design: Design) -> QPMPC:
-    """Return the QPMPC whose policy maps [r; w; d; 1] to v, or to a if f has a QP of its own."""
-    steady, n_y, split = design.steady, len(design.Q), is_split(design)
-    n_v = steady.n_a if split else steady.Y.shape[1]
-    n_x = n_y + steady.y.shape[1]
-    # y_s - r and u_s as maps of [r; w; d; 1; v].
-    error = np.hstack((-np.eye(n_y), steady.y, steady.Y))
-    inputs = np.hstack((np.zeros((len(steady.U), n_y)), steady.u, steady.U))
+    """Return the QPMPC whose policy maps [f_0; r; w; d; 1] to v."""
+    steady, n_y, n_f = design.steady, len(design.Q), anchored(design)
+    n_r, n_x = n_f + n_y, n_f + n_y + steady.y.shape[1]
+    # y_s - r and u_s as maps of [f_0; r; w; d; 1; v].
+    error = np.hstack((-np.eye(n_y, n_r, n_f), steady.y, steady.Y))
+    inputs = np.hstack((np.zeros((len(steady.U), n_r)), steady.u, steady.U))
     weight = _squares(error, design.Q)
-    if len(steady.W) and not split:
-        weight[n_x + steady.n_a :, n_x + steady.n_a :] += 2 * _preference(design) * steady.W
-    y, u, _, d = design.scaling
-    K = np.eye(len(d), error.shape[1], n_x - 1 - len(d))
+    if len(steady.W):
+        f = np.eye(len(steady.W), len(weight), n_x + steady.n_a)
+        f[:, :n_f] -= np.eye(len(f), n_f)
+        weight += _squares(f, _preference(design) * steady.W)
+    u, n_d = design.scaling.u, design.plant.sizes[3]
+    K = np.eye(n_d, error.shape[1], n_x - 1 - n_d)
     D, lower, upper, of = design.rows(1, inputs, K)
-    moved, of_s = D[:, n_x:].any(-1), np.concatenate((y, design.of_w(y), d, [1.0]))
+    moved = D[:, n_x:].any(-1)
     D, lower, upper = ((part.T / u[of]).T[moved] for part in (D, lower, upper))
-    D[:, :n_x] *= of_s
-    if split:
-        D, lower, upper = _without_last(D, lower, upper, len(steady.W))
-    D[:, :n_x] /= of_s
-    error[:, :n_y] = 0.0
-    *soft, of = design.rows(0, error[:, : n_x + n_v], K[:, : n_x + n_v])
+    error[:, :n_r] = 0.0
+    *soft, of = design.rows(0, error, K)
     moved = soft[0][:, n_x:].any(-1)
     price = np.full(len(D), np.inf)
     if np.linalg.matrix_rank(steady.U / u[:, None], RANK) < len(u):
         # The plant integrates, and a load may have no steady inputs within bounds.
         price[:] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
     slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[of[moved]])
-    rows = zip((D[:, : n_x + n_v], lower, upper), soft, strict=True)
+    rows = zip((D, lower, upper), soft, strict=True)
     rows = tuple(np.concatenate((of_u, of_y[moved])) for of_u, of_y in rows)
-    weight = weight[: n_x + n_v, : n_x + n_v]
     return _of_one_stage(n_x, weight, SCALE * design.typical, rows, slack)
 
 
 def free_mpc(design: Design) -> QPMPC | None:
     """Return the QPMPC whose policy maps [a; w; d; 1] to f, None if f has no QP of its own."""
-    if not is_split(design):
-        return None
     steady, n_a = design.steady, design.steady.n_a
+    if not anchored(design) or steady.Y[design.bounded[0], n_a:].any():
+        return None
     n_x = n_a + steady.u.shape[1]
     n_d = design.plant.sizes[3]
     D = np.hstack((steady.U[:, :n_a], steady.u, steady.U[:, n_a:]))
@@ -297,35 +296,6 @@ def _of_one_stage(
     layout, one = Layout(n_x, n_v, horizon=1), {n_x - 1: 1.0}
     scheme = Scheme(layout, model, cost, bounds, gamma=1.0, constants=one)
     return QPMPC(scheme, learn=(), solver="daqp")
-
-
-def _without_last(D: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array, Array]:
-    """Return the rows that are left of lower <= D [x; f] <= upper if some f may be chosen.
-
-    They are the sums of rows without f that no other sums imply: those in which as many rows as
-    possible have no part (the result of Fourier-Motzkin elimination without redundant rows).
-    ``count`` is the number of entries of f.
-    """
-    left, supports = [], set()
-    sums = scipy.linalg.null_space(D[:, -count:].T, rcond=RANK)
-    n = sums.shape[1]
-    for apart in map(list, combinations(range(len(D)), n - 1) if n else ()):
-        mix = scipy.linalg.null_space(sums[apart], rcond=RANK) if apart else np.eye(n)
-        if mix.shape[1] > 1:
-            continue
-        factor = sums @ mix[:, 0]
-        chosen = np.flatnonzero(np.abs(factor) > RANK * np.abs(factor).max())
-        if chosen.tobytes() in supports:
-            continue
-        supports.add(chosen.tobytes())
-        factor = factor[chosen]
-        ends = np.sort(factor * np.stack((lower[chosen], upper[chosen])), axis=0).sum(-1)
-        if np.isfinite(ends).any():
-            left.append((factor @ D[chosen], *ends))
-    parts = zip(*left, strict=True) if left else (D[:0], lower[:0], upper[:0])
-    rows, lower, upper = map(np.array, parts)
-    rows[np.abs(rows) < RANK] = 0.0
-    return rows, lower, upper
 
 
 def _preference(design: Design) -> float:

@@ -12,7 +12,6 @@ import torch
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
-from torch_qpmpc.control.exporting import WEIGHT, undetermined
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
@@ -101,10 +100,6 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         findings += [_margin(loop, law), _offset(loop, design)]
         if design.plant.noise is not None:
             findings.append(_noise(loop, law, design.plant.noise))
-    text = "The design can be exported as C."
-    if names := undetermined(mpc):
-        text = f"export_c refuses the bounds of {names}: no output with a weight determines them."
-    findings.append(Finding("C code", not names, text, WEIGHT.format(names) * bool(names)))
     return Review(findings)
 
 

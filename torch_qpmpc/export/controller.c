@@ -11,8 +11,8 @@
 typedef policy_real real;
 
 enum { N_X = POLICY_N_X, N_W = POLICY_N_W, N_E = POLICY_N_E, N_U = POLICY_N_U };
-enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_A = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
-enum { N_V = N_A + POLICY_N_F, STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
+enum { N_Y = POLICY_N_Y, N_D = POLICY_N_D, N_V = POLICY_TARGET_N_U, LOADS = N_W + N_D + 1 };
+enum { N_F = POLICY_N_F, N_A = N_V - N_F, STAGES = POLICY_STAGES, SET_POINTS = POLICY_SET_POINTS };
 
 enum { LAST = POLICY_GAINS - 1 }; /* the steady gain */
 enum { UNKNOWN = -2, STARTS = -1 }; /* of steps: before known signals, and before estimates */
@@ -194,6 +194,18 @@ static int see(policy_state *s, const real y[], const real known[], int stages)
     return !valid ? POLICY_INVALID : missing ? POLICY_MISSING : POLICY_SOLVED;
 }
 
+/* Take set-points, but for outputs without a weight, whose stay zero; return 1 if all are sane. */
+static int take(policy_state *s, const real r[])
+{
+    int i, k;
+    for (k = 0; k < SET_POINTS * N_Y; k += N_Y)
+        for (i = 0; i < POLICY_WEIGHTED; i++)
+            if (!is_sane(r[k + OF_R[i]], MOST_Y[OF_R[i]])) return 0;
+    for (k = 0; k < SET_POINTS * N_Y; k += N_Y)
+        for (i = 0; i < POLICY_WEIGHTED; i++) s->r[k + OF_R[i]] = r[k + OF_R[i]];
+    return 1;
+}
+
 /* Set the set-points that the plan weighs: r, but for what the outputs' bounds hold off. */
 static void weigh(policy_state *s, const real r[])
 {
@@ -221,15 +233,23 @@ static void weigh(policy_state *s, const real r[])
 /* Set the target for the signals of a stage; return the code of its QPs. */
 static int aim(policy_state *s, const real r[], const real known[])
 {
-    real loads[LOADS], t[N_A + POLICY_TARGET_N_P], v[N_V];
-    int i, code;
+    real loads[LOADS], t[POLICY_TARGET_N_P], v[N_V];
+    int i, round, stays = 0, code = POLICY_SOLVED;
     copy(loads, s->e + N_X, N_W);
     for (i = 0; i < N_D; i++) loads[N_W + i] = known[i] - NOMINAL[i];
     loads[LOADS - 1] = 1;
-    copy(t, r, N_Y);
-    copy(t + N_Y, loads, LOADS);
-    code = policy_target_step(&s->target, t, v, 0);
-#if POLICY_N_F
+    for (i = 0; i < N_F; i++) t[i] = 0;
+    copy(t + N_F, r, N_Y);
+    copy(t + N_F + N_Y, loads, LOADS);
+    for (round = 0; round < POLICY_ROUNDS && !stays && code == POLICY_SOLVED; round++) {
+        code = policy_target_step(&s->target, t, v, 0);
+        for (i = 0, stays = 1; i < N_F; i++) {
+            real f = v[N_A + i], by = f - t[i], near = STAYS[0] * (1 + (f < 0 ? -f : f));
+            if (!(by <= near && -by <= near)) stays = 0;
+            t[i] = f;
+        }
+    }
+#if POLICY_FREE
     if (code == POLICY_SOLVED) {
         copy(t, v, N_A);
         copy(t + N_A, loads, LOADS);
@@ -289,7 +309,7 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
     int i;
     policy_plan_reset(&s->plan);
     policy_target_reset(&s->target);
-#if POLICY_N_F
+#if POLICY_FREE
     policy_free_reset(&s->free);
 #endif
 #if POLICY_CARRIES
@@ -319,8 +339,7 @@ int policy_observe(policy_state *s, const real y[], const real u[], const real k
 
 int policy_step(policy_state *s, const real y[], const real r[], const real known[], real u[])
 {
-    int i, code, seen = see(s, y, known, STAGES), sane = !r || are_sane(r, MOST_Y, SET_POINTS, N_Y);
-    if (r && sane) copy(s->r, r, SET_POINTS * N_Y);
+    int i, code, seen = see(s, y, known, STAGES), sane = !r || take(s, r);
     code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
     for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
     if (s->steps >= 0) predict(s, s->u);
@@ -337,7 +356,7 @@ int policy_selftest(void)
     int i, j;
     if (policy_plan_selftest()) return 1;
     if (policy_target_selftest()) return 2;
-#if POLICY_N_F
+#if POLICY_FREE
     if (policy_free_selftest()) return 2;
 #endif
     policy_reset(&state, 0, EXAMPLE_START[0], 0);

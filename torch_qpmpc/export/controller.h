@@ -6,7 +6,7 @@
 
 #include "policy_plan.h"
 #include "policy_target.h"
-#if POLICY_N_F
+#if POLICY_FREE
 #include "policy_free.h"
 #endif
 
@@ -36,7 +36,7 @@ typedef struct {
     policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
     policy_plan_state plan;
     policy_target_state target;
-#if POLICY_N_F
+#if POLICY_FREE
     policy_free_state free;
 #endif
 #if POLICY_CARRIES
@@ -64,9 +64,10 @@ void policy_reset(policy_state *state, const policy_real y[], const policy_real 
    the gains of the outputs that follow know that it was missing; else they are steady, which is
    right for a few missing outputs, and not for sensors that answer in some steps only. r has
    POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last ones;
-   they start as zero. known has POLICY_STAGES rows of POLICY_N_D known signals, of this and later
-   steps. With the codes 0 and 4, u keeps the bounds of inputs and of their moves to rounding; with
-   another it is the last input, which keeps them, too. The estimates go on with each code. */
+   they start as zero. Outputs without a weight need none. known has POLICY_STAGES rows of POLICY_N_D
+   known signals, of this and later steps. With the codes 0 and 4, u keeps the bounds of inputs and
+   of their moves to rounding; with another it is the last input, which keeps them, too. The
+   estimates go on with each code. */
 int policy_step(policy_state *state, const policy_real y[], const policy_real r[],
                 const policy_real known[], policy_real u[]);
 
