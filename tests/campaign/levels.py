@@ -35,7 +35,7 @@ def times(count: int) -> None:
         assert levels is not None
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            searches, runs = Searches(levels, qp, 3, "daqp"), np.zeros(1, np.int64)
+            searches, runs = Searches(mpc), np.zeros(1, np.int64)
             searches.solve(s.numpy()[None], runs)
             began = time.process_time()
             searches.solve(s.numpy()[None], runs)

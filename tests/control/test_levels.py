@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import torch_qpmpc as qm
+from tests.control.controllers import load
+from torch_qpmpc.export.library import compiler
 
 LEVELS = (0.0, 4.0, 8.0)
 
 
-def of(**options) -> qm.LinearMPC:
+def of(model=([[0.9]], [[0.1]]), **options) -> qm.LinearMPC:
     """Return the MPC of a room with a heat pump that has two speeds and a load."""
     defaults = {
         "Q": {"T": 1.0},
@@ -22,7 +24,7 @@ def of(**options) -> qm.LinearMPC:
         "inputs": ["q"],
         "outputs": ["T"],
     }
-    return qm.LinearMPC(([[0.9]], [[0.1]]), 8, **{**defaults, **options})
+    return qm.LinearMPC(model, 8, **{**defaults, **options})
 
 
 def runs_of(u: np.ndarray) -> list[tuple[bool, int]]:
@@ -115,6 +117,55 @@ def test_wrong_levels_are_errors(options, match):
         of(**options)
 
 
-def test_c_code_of_levels_is_refused(tmp_path):
-    with pytest.raises(qm.QPError, match=r"mpc: got one with action_levels, .* for C code"):
-        qm.Controller(of()).export_c(tmp_path)
+#: Designs whose C is compared: three levels, on and off beside an input without levels, and a cap.
+DESIGNS = {
+    "levels": dict,
+    "a limit of moves": lambda: {"du_bounds": {"q": (-4.0, 4.0)}, "R": {"q": 0.01}},
+    "few nodes": lambda: {"max_nodes": 6},
+    "two inputs": lambda: {
+        "model": ([[0.9, 0.05], [0.0, 0.8]], [[0.1, 0.0], [0.02, 0.1]]),
+        "inputs": ["q", "v"],
+        "u_levels": {"q": (0.0, 6.0)},
+        "u_bounds": {"v": (-1.0, 1.0)},
+        "outputs": ["T", "h"],
+        "Q": {"T": 1.0, "h": 1.0},
+    },
+}
+
+
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("name", DESIGNS)
+def test_c_equals_python_with_minimum_times_manual_mode_and_missing_outputs(name, tmp_path):
+    controller = qm.Controller(of(**DESIGNS[name]()))
+    report = controller.export_c(tmp_path, missing=True)
+    twin, rng = load(report.files, controller), np.random.default_rng(0)
+    A, B, C = (np.array(getattr(controller.mpc.design.plant, x)) for x in "ABC")
+    x, codes, applied = np.zeros(len(A)), set(), []
+    for k in range(200):
+        y = C @ x + 0.02 * rng.normal(size=len(C))
+        y[rng.random(len(C)) < 0.1 * (k > 0)] = np.nan
+        r = np.append([2.0 + 2.0 * (k // 20 % 2)], np.zeros(len(C) - 1))
+        r = np.nan * r if k == 70 else r
+        if 50 <= k < 54 or k == 120:
+            u = np.append([6.0 * (k < 53)], np.zeros(B.shape[1] - 1))
+            controller.observe(y, u)
+            twin.observe(y, u)
+        else:
+            u = controller.step(y, r)
+            got, code = twin.step(y, r)
+            np.testing.assert_allclose(got, u, atol=1e-9)
+            assert code == controller.status
+            codes.add(code)
+            applied.append(u[0])
+        x = A @ x + B @ u
+    assert codes == {0, 3, 4, *[5] * (name == "few nodes")}
+    assert {*applied} <= {*controller.mpc.design.levels["q"]}
+    text = next(file for file in report.files if file.name == "policy.h").read_text()
+    assert f"has {twin.state_bytes} bytes" in text
+    plan = next(file for file in report.files if file.name == "policy_plan.h").read_text()
+    assert f"at most {controller.mpc.design.switching['max_nodes'] + 1}." in plan
+
+
+def test_a_simulation_goes_on_with_the_best_plan_that_the_search_found():
+    controller = qm.Controller(of(max_nodes=6))
+    assert {*controller.simulate(steps=20, r=[3.0]).u[:, 0]} <= {*LEVELS}

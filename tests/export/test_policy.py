@@ -191,10 +191,11 @@ def test_compilers_agree_without_a_warning(name, level, exported):
 
 def test_sanitizers_find_nothing(tmp_path):
     """Those of a controller's C, in tests/control/test_bad_hours.py, see the other storage."""
-    mpc = tied(4, state_slack=torch.inf)
+    levels = {"action_levels": [(-1.0, 0.2, 1.0)], "min_on": 2, "start_cost": 0.1}
+    mpc = tied(4, **levels)
     export_c(mpc, tmp_path, storage="small")
     (tmp_path / "p.bin").write_bytes(draw_known(mpc, 40).tobytes())
-    flags = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    flags = (*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     try:
         found = built(["cc", "-std=c99"], tmp_path, *flags)
     except subprocess.CalledProcessError as error:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
+from torch_qpmpc.export.library import compiler
 
 N = 8
 
@@ -66,7 +67,7 @@ def enumerated(
     bounds, levels = mpc.scheme.bounds, mpc.levels
     assert levels is not None
     each = [
-        sequences_of(levels.counts[a], bounds.min_off[a], bounds.min_on[a], mpc.horizon)
+        sequences_of(len(bounds.action_levels[a]), bounds.min_off[a], bounds.min_on[a], mpc.horizon)
         for a in range(mpc.n_u)
     ]
     plans = np.stack([np.stack(x, -1) for x in itertools.product(*each)])  # (n, N, m)
@@ -104,9 +105,7 @@ def test_value_and_policy_equal_enumeration(seed):
 def test_action_value_equals_enumeration_on_levels_and_is_infeasible_between_them(seed):
     mpc, s = drawn(seed, most=5000)
     rng = np.random.default_rng(seed)
-    a = torch.tensor(
-        [x[rng.integers(n)] for x, n in zip(mpc.levels.values, mpc.levels.counts, strict=True)]
-    )
+    a = torch.tensor([rng.choice(x) for x in mpc.scheme.bounds.action_levels])
     best, _ = enumerated(mpc, s, a.numpy())
     assert mpc.action_value(s, a).item() == pytest.approx(best, rel=1e-6, abs=1e-9)
     assert mpc.action_value(s, mpc.policy(s)).item() == pytest.approx(mpc.value(s).item(), rel=1e-6)
@@ -217,8 +216,20 @@ def test_wrong_levels_are_errors(options, match):
         of(**options)
 
 
-def test_what_needs_one_qp_refuses_levels():
-    with pytest.raises(qm.QPError, match=r"mpc: got one with action_levels, expected .* C code"):
-        qm.export_c(of(), "nowhere")
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+@pytest.mark.parametrize("seed", [2, 5])
+def test_compiled_policies_equal_python(seed):
+    mpc, _ = drawn(seed, most=5000)
+    policy, rng = qm.CompiledPolicy(mpc), np.random.default_rng(seed)
+    s = torch.from_numpy(2 * rng.normal(size=(10, mpc.n_p)))
+    for _ in range(2):  # from nothing, and from the last plan
+        torch.testing.assert_close(policy.value(s), mpc.value(s), rtol=1e-8, atol=1e-9)
+        torch.testing.assert_close(policy(s), mpc.policy(s), rtol=0, atol=1e-8)
+    capped = qm.CompiledPolicy(qm.QPMPC.of(**mpc.arguments | {"max_nodes": 20}))
+    assert capped.value(s).isfinite().all()
+    assert 5 in capped.last.codes
+
+
+def test_what_depends_on_values_refuses_to_be_traced():
     with pytest.raises(qm.QPError, match="action_levels: got a traced call"):
         torch.func.grad(lambda s: of().value(s).sum())(torch.ones(1, dtype=torch.float64))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import PREFIX
-from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
+from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
 from torch_qpmpc.control.review import Setting, set_points
 from torch_qpmpc.control.simulation import Run, last_known
 from torch_qpmpc.control.state_space import Array
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 #: A multiplier this small, relative to a typical stage's cost for a usual deviation, is rounding.
 ACTIVE = 1e-6
-PLANNED = (Outcome.SOLVED, Outcome.MISSING, Outcome.NODE_LIMIT)
 
 
 class Limit(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torch_qpmpc.control.design import largest
-from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
+from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import ROUNDS, STAYS
 from torch_qpmpc.control.observer import STEADY
@@ -25,7 +25,7 @@ from torch_qpmpc.export.export import Export, check_name, export_c
 from torch_qpmpc.export.fmu import Variable, write_fmu
 from torch_qpmpc.export.library import FLAGS, compiled, compiler, required_compiler
 from torch_qpmpc.export.tables import make_tables
-from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled
+from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled, integers
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
 COMPARED, REPLAYED = 200, 10
@@ -128,9 +128,9 @@ class CompiledController:
         return self._u.astype(np.float64), code
 
     def policy(self, signals: Signals) -> Any:
-        """Return the move of a step, with a NaN input if its code is not 0."""
+        """Return the move of a step, with a NaN input if it has no plan."""
         u, code = self.step(*signals)
-        return SimpleNamespace(u=np.where(code == 0, u, np.nan), status=Outcome.SOLVED)
+        return SimpleNamespace(u=np.where(code in PLANNED, u, np.nan), status=Outcome.SOLVED)
 
     def _call(self, function: Any, *signals: Any) -> int:
         numbers = [None if x is None else np.asarray(x, self._dtype, order="C") for x in signals]
@@ -177,6 +177,7 @@ def export_controller(
         if (failed := library.selftest()) or wrong:
             got = f"{dtype!r}, with a failed self-test ({failed}) or inputs off by {difference}"
             raise QPError.expected("dtype", got, "a controller that agrees", "Export float64.")
+    texts[f"{name}.h"] = texts[f"{name}.h"].replace("@BYTES@", f"{state_bytes or 'some'}")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
@@ -284,7 +285,8 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
         move = policy(Signals(y * (1 + rounding[k]), r, known))
         # At the edge of hard bounds there may be no plan.
-        if k == REPLAYED or (k and (move.status or (np.abs(move.u - u) > near).any())):
+        far = k and (move.status or (np.abs(move.u - u) > near).any())
+        if far or k == REPLAYED or move.status == Outcome.NODE_LIMIT:
             return Loop(loop.y[:k], loop.r[:k], loop.known[:k], loop.u[:k], loop.start)
     return loop
 
@@ -296,14 +298,9 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict
     sizes[f"{name.upper()}_CARRIES"] = int(missing)
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
     tables = [array(key, x, dtype) for key, x in _tables(law, dtype, missing).items()]
-    indices = {
-        f"OF_{key}": places
-        for key, places in zip("RYU", (design.weighted, *design.bounded_places), strict=True)
-    } | dict(zip(("LOWER_OF", "UPPER_OF"), design.limited[1], strict=True))
-    tables += [
-        f"static const int {key}[] = {{{', '.join(map(str, x)) or 0}}};"
-        for key, x in indices.items()
-    ]
+    names = "OF_R", "OF_Y", "OF_U", "LOWER_OF", "UPPER_OF"
+    places = design.weighted, *design.bounded_places, *design.limited[1]
+    tables += map(integers, names, places)
     replayed = _replayed(law, loop, dtype)
     examples = {
         f"EXAMPLE_{key.upper()}": x.reshape(len(x), math.prod(x.shape[1:]))
@@ -327,6 +324,7 @@ def _signals(plant: StateSpace, name: str) -> list[str]:
     groups = {"y and r": plant.outputs, "known": plant.known, "u": plant.inputs}
     return [
         f"{name}: a linear MPC with an observer, by torch_qpmpc{every}.",
+        "Its state has @BYTES@ bytes.",
         *(f"{key}: {', '.join(map(plant.label, names))}" for key, names in groups.items() if names),
     ]
 
@@ -358,6 +356,8 @@ def _sizes(law: Law) -> dict[str, int]:
         "MOVES": width["u_last"],
         "BOUNDED_Y": width["y_s"],
         "BOUNDED_U": width["u_s"],
+        "LEVELS": law.levels.shape[1],
+        "RUNS": int(levels.rules.sum(1).max()) if (levels := law.mpc.plan.levels) else 0,
     }
 
 
@@ -383,6 +383,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
         "MOST_U": law.max_plausible_u,
         "STAYS": np.array([max(STAYS, 100 * np.finfo(dtype).eps)]),
+        **({"INPUT_LEVELS": law.levels, "SWITCH": law.switches} if design.levels else {}),
     }
 
 

@@ -101,6 +101,10 @@ class Outcome(IntEnum):
         )[self]
 
 
+#: Those with a plan.
+PLANNED = (Outcome.SOLVED, Outcome.MISSING, Outcome.NODE_LIMIT)
+
+
 class Move(NamedTuple):
     """The result of a step: the input, the memory after it, and target and p of a plan, if any."""
 
@@ -189,7 +193,7 @@ class Law:
         last = np.zeros(len(self.design.plant.inputs)) if u is None else u
         last = np.clip(last, *self.design.u_bounds)
         steps = len(self.observer.gains) - 1 if rests else 0
-        runs = np.where(last > self._switches, LONG, -LONG)
+        runs = np.where(last > self.switches, LONG, -LONG)
         return Memory(last, rest=(None, None if u is None else last), steps=steps, runs=runs)
 
     def estimates(self, memory: Memory) -> tuple[Array, Array]:
@@ -231,54 +235,49 @@ class Law:
     @cached_property
     def searches(self) -> Searches | None:
         """The searches for plans on levels, with the theta of their first use; None without."""
-        plan = self.mpc.plan
-        if plan.levels is None:
-            return None
-        with torch.no_grad():
-            qp = plan.quadratic_program()
-        return Searches(plan.levels, qp, plan.n_p + plan.n_u, plan.solver)
+        return None if self.mpc.plan.levels is None else Searches(self.mpc.plan)
 
     def _planned(self, p: Array, memory: Memory) -> tuple[Array, Status, Array | None]:
         """Return the plan's z, its status, and the levels that it has from the next step on."""
-        levels = self.mpc.plan.levels
-        if self.searches is None or levels is None:
-            plan = self.plans.solve(p[None])
-            return plan.z[0], Status(int(plan.status[0])), None
-        assert memory.runs is not None
-        plan, places = self.searches.solve(p[None], memory.runs[levels.actions], memory.ahead)
-        return plan.z[0], Status(int(plan.status[0])), np.append(places[:, 1:], places[:, -1:], 1)
+        if self.searches is None:
+            plan, ahead = self.plans.solve(p[None]), None
+        else:
+            plan, places = self.searches.solve(p[None], memory.runs, memory.ahead)
+            ahead = np.append(places[:, 1:], places[:, -1:], 1)
+        return plan.z[0], Status(int(plan.status[0])), ahead
 
     def plan(self, p: Array, memory: Memory) -> tuple[Array, Array]:
         """Return z and the rows' multipliers of the plan with p, from the memory after its step.
 
         Those of decisions on levels are zero.
         """
-        levels = self.mpc.plan.levels
-        if self.searches is None or levels is None:
+        if self.searches is None:
             plan = self.plans.solve(p[None])
-            return plan.z[0], plan.lam[0]
-        assert memory.ahead is not None
-        off = np.abs(memory.u[levels.actions, None] - levels.values)
-        off[np.arange(off.shape[1]) >= levels.counts[:, None]] = np.inf
-        places = np.column_stack((off.argmin(1), memory.ahead[:, :-1]))
-        plan = self.searches.held(p[None], places)
-        plan.lam[0, levels.rows] = 0.0
+        else:
+            plan = self.searches.held(p[None], memory.u, memory.ahead)
         return plan.z[0], plan.lam[0]
 
     @cached_property
-    def _switches(self) -> Array:
+    def switches(self) -> Array:
         """What each input exceeds if it is on: the middle of its lowest levels, ``(m,)``."""
         levels = (self.design.levels.get(name, ()) for name in self.design.plant.inputs)
         return np.array([np.mean(own[:2]) if own else np.inf for own in levels])
 
+    @cached_property
+    def levels(self) -> Array:
+        """The levels of inputs within their bounds, ``(m, L)``, and inf behind them."""
+        of, sides = self.design.levels, zip(*self.design.u_bounds, strict=True)
+        sides = zip(self.design.plant.inputs, sides, strict=True)
+        within = [[x for x in of.get(name, ()) if low <= x <= high] for name, (low, high) in sides]
+        most = max(map(len, within))
+        return np.array([[*own, *[np.inf] * (most - len(own))] for own in within])
+
     def _on_level(self, u: Array) -> Array:
         """Return inputs at their nearest levels within their bounds."""
-        u = u.copy()
-        for name, own in self.design.levels.items():
-            a = self.design.plant.inputs.index(name)
-            lower, upper = (side[a] for side in self.design.u_bounds)
-            u[a] = min((x for x in own if lower <= x <= upper), key=lambda x: abs(x - u[a]))
-        return u
+        if not self.design.levels:
+            return u
+        nearest = self.levels[np.arange(len(u)), np.abs(self.levels - u[:, None]).argmin(1)]
+        return np.where(np.isfinite(nearest), nearest, u)
 
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
@@ -357,7 +356,7 @@ class Law:
         if e is not None:
             assert memory.known is not None
             e = self.observer.predicted(e, u, memory.known)
-        on, runs = u > self._switches, np.zeros(len(u)) if memory.runs is None else memory.runs
+        on, runs = u > self.switches, np.zeros(len(u)) if memory.runs is None else memory.runs
         runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
         runs = np.clip(runs, -LONG, LONG).astype(np.int64)
         return memory._replace(u=self._within(u, memory), e=e, runs=runs)

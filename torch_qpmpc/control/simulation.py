@@ -11,7 +11,7 @@ import torch
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
-from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
+from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.scaling import FAINT, Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
@@ -152,7 +152,7 @@ def closed_loop(
         ahead = law.read_known(info.get("known"), rows) if announced else d[k : k + rows]
         signals = Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead)
         move = act(signals)
-        if move.status not in (Outcome.SOLVED, Outcome.MISSING):
+        if move.status not in PLANNED:
             remedy = "Widen the hard bounds, or give the outputs a y_slack."
             raise SolverError(f"Step {k} of the loop has no plan: {move.status.name}. {remedy}")
         return move

@@ -16,7 +16,7 @@ from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import TINY, Array, Tables, far
 from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.pipeline.arrays import BatchSolution
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_numpy
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
@@ -63,13 +63,23 @@ class Agreement:
 
 
 @torch.no_grad()
-def programs(mpc: QPMPC, p: Array) -> Programs:
-    """Return V's QPs at p ``(B, n_p)``."""
-    return Programs.of(*mpc.quadratic_program().tensors(), torch.as_tensor(p))[0]
+def programs(mpc: QPMPC, p: Array, z: Array | None = None) -> Programs:
+    """Return V's QPs at p ``(B, n_p)``, with actions on levels as they are in z, if it is given."""
+    qp = mpc.quadratic_program()
+    if mpc.levels is not None and z is not None:
+        y = (torch.as_tensor(z) @ qp.G.mT)[:, mpc.levels.rows, None].numpy()
+        off = np.abs(y - mpc.levels.values[:, None])
+        qp = mpc.levels.held(qp, off.argmin(-1), p.shape[:1])
+    return Programs.of(*qp.tensors(), torch.as_tensor(p))[0]
 
 
 def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> BatchSolution:
     """Return the certified solutions of V at p ``(B, n_p)`` by a solver of the package."""
+    if mpc.levels is not None:
+        qp, s = mpc.quadratic_program(), torch.as_tensor(p)
+        with torch.no_grad():
+            best = mpc.levels.solve(qp, s, mpc.n_p + mpc.n_u, mpc.solver, "mask")
+        return BatchSolution._make(to_numpy(getattr(best, x)) for x in BatchSolution._fields)
     qps = programs(mpc, p)
     return solve_programs(qps, solver or ("torch" if _is_large(qps) else "daqp"))
 
@@ -87,10 +97,10 @@ def _is_large(qps: Programs) -> bool:
 
 def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
     """Refine the solutions of ``coarse`` at the indices ``which``."""
-    qps, exact = programs(mpc, p), coarse.at(np.arange(len(p)))
+    qps, exact = programs(mpc, p, coarse.z), coarse.at(np.arange(len(p)))
     if len(which) and not _is_large(qps):
         refine(qps, exact, which, last=True)
-    return exact
+    return exact if mpc.levels is None else exact._replace(value=coarse.value)  # has starts
 
 
 def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution]:
@@ -99,7 +109,7 @@ def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution
     def solve(p: Array) -> BatchSolution:
         return reference(mpc, p.astype(dtype).astype(np.float64))
 
-    count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2)
+    count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2) * (not mpc.levels)
     p, exact = nearer(tables, draw(tables, max(count, min(LEAST, COMPARED))), solve)
     return p.astype(dtype).astype(np.float64), exact
 

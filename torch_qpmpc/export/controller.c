@@ -54,6 +54,28 @@ static real within(const policy_state *s, real x, int i)
     return x > upper ? upper : x;
 }
 
+#if POLICY_LEVELS
+/* Return the level of input i that is nearest to x; without levels x. */
+static real on_level(real x, int i)
+{
+    real level = INPUT_LEVELS[i][0];
+    int k;
+    for (k = 1; k < POLICY_LEVELS; k++)
+        if (x > (INPUT_LEVELS[i][k - 1] + INPUT_LEVELS[i][k]) / 2) level = INPUT_LEVELS[i][k];
+    return level < BIG ? level : x;
+}
+
+/* Count the steps on and off, of which u is the last one. */
+static void count(policy_state *s, const real u[])
+{
+    int i, *runs = s->plan.runs;
+    for (i = 0; i < N_U; i++) {
+        if (u[i] > SWITCH[i]) runs[i] = runs[i] < 0 ? 1 : runs[i] + (runs[i] < POLICY_RUNS);
+        else runs[i] = runs[i] > 0 ? -1 : runs[i] - (runs[i] > -POLICY_RUNS);
+    }
+}
+#endif
+
 /* Predict the estimates of the next step with the input u. */
 static void predict(policy_state *s, const real u[])
 {
@@ -295,7 +317,8 @@ static int plan(policy_state *s, const real known[])
     for (i = 0; i < POLICY_BOUNDED_Y; i++) *p++ = s->y_s[OF_Y[i]];
     for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
     *p = 1;
-    if ((code = policy_plan_step(&s->plan, s->p, move, 0)) != POLICY_SOLVED) return code;
+    code = policy_plan_step(&s->plan, s->p, move, 0);
+    if (code != POLICY_SOLVED && code != POLICY_NODE_LIMIT) return code;
     for (i = 0; i < N_U; i++) {
         real by = (move[i] = within(s, s->u_s[i] + move[i], i)) - s->u[i];
         if (!(by >= MOVE_LOWER[i] && by <= MOVE_UPPER[i])) return POLICY_LIMIT;
@@ -319,6 +342,9 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
     for (i = 0; i < POLICY_N_D_; i++) s->known[i] = 0;
     s->steps = UNKNOWN;
     for (i = 0; i < N_U; i++) s->u[i] = within(s, u && is_sane(u[i], MOST_U[i]) ? u[i] : 0, i);
+#if POLICY_LEVELS
+    for (i = 0; i < N_U; i++) s->plan.runs[i] = s->u[i] > SWITCH[i] ? POLICY_RUNS : -POLICY_RUNS;
+#endif
     for (i = 0; i < SET_POINTS * N_Y; i++) s->r[i] = 0;
     if (y && are_sane(y, MOST_Y, 1, N_Y) && (!N_D || (known && are_sane(known, MOST_KNOWN, 1, N_D)))) {
         copy(s->known, known, N_D);
@@ -333,6 +359,9 @@ int policy_observe(policy_state *s, const real y[], const real u[], const real k
     real applied[N_U];
     for (i = 0; i < N_U; i++) applied[i] = u && is_sane(u[i], MOST_U[i]) ? u[i] : s->u[i];
     if (s->steps >= 0) predict(s, applied);
+#if POLICY_LEVELS
+    count(s, applied);
+#endif
     for (i = 0; i < N_U; i++) s->u[i] = within(s, applied[i], i);
     return code;
 }
@@ -342,6 +371,11 @@ int policy_step(policy_state *s, const real y[], const real r[], const real know
     int i, code, seen = see(s, y, known, STAGES), sane = !r || take(s, r);
     code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
     for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
+#if POLICY_LEVELS
+    for (i = 0; i < N_U; i++) s->u[i] = on_level(s->u[i], i);
+    count(s, s->u);
+    if (code != POLICY_SOLVED && code != POLICY_NODE_LIMIT) s->plan.hint[0] = -1;
+#endif
     if (s->steps >= 0) predict(s, s->u);
     copy(u, s->u, N_U);
     return code ? code : seen;

@@ -22,6 +22,7 @@ typedef policy_plan_real policy_real;
 #define POLICY_INFEASIBLE 2 /* no plan or no steady state satisfies the hard bounds */
 #define POLICY_INVALID 3    /* r or known, or y before there are estimates, has a missing number */
 #define POLICY_MISSING 4    /* as POLICY_SOLVED, for estimates that y, with a missing number, left */
+#define POLICY_NODE_LIMIT 5 /* the best plan on levels that the search found; a better one may exist */
 
 /* The state of a controller: estimates, the last signals, and the active sets of all QPs. */
 typedef struct {
@@ -52,7 +53,8 @@ typedef struct {
 /* Forget the past: the plant rests with the outputs y, the input u and the known signals of this
    step, of which there are POLICY_N_D. If one of y or known is missing, or the pointer is null, it
    is in a state of the log of the model; without a log it rests with those of the first step. A
-   missing entry of u is zero. u is clipped into its bounds.
+   missing entry of u is zero. u is clipped into its bounds. Inputs on levels have been on or off for
+   longer than their minimum times; what policy_step and policy_observe apply counts from then on.
 
    u is the last input, which moves are counted from: another than the plant's is a bump. */
 void policy_reset(policy_state *state, const policy_real y[], const policy_real u[],
@@ -65,7 +67,7 @@ void policy_reset(policy_state *state, const policy_real y[], const policy_real 
    right for a few missing outputs, and not for sensors that answer in some steps only. r has
    POLICY_SET_POINTS rows of POLICY_N_Y set-points, of which a null pointer repeats the last ones;
    they start as zero. Outputs without a weight need none. known has POLICY_STAGES rows of POLICY_N_D
-   known signals, of this and later steps. With the codes 0 and 4, u keeps the bounds of inputs and
+   known signals, of this and later steps. With the codes 0, 4 and 5, u keeps the bounds of inputs and
    of their moves to rounding; with another it is the last input, which keeps them, too. The
    estimates go on with each code. */
 int policy_step(policy_state *state, const policy_real y[], const policy_real r[],

@@ -22,7 +22,7 @@ from torch_qpmpc.export.writer import filled
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The values of the variable ``status``: the codes of C, in their order.
-CODES = ("SOLVED", "LIMIT", "INFEASIBLE", "INVALID", "MISSING")
+CODES = ("SOLVED", "LIMIT", "INFEASIBLE", "INVALID", "MISSING", "NODE_LIMIT")
 #: FMI's words for machines and systems, and what a library's name ends with.
 MACHINES = {"AMD64": "x86_64", "arm64": "aarch64"}
 SYSTEMS = {"win32": ("windows", "dll"), "darwin": ("darwin", "dylib")}

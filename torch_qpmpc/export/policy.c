@@ -97,28 +97,36 @@ static void respond_anew(policy_state *s)
     respond(s);
 }
 
+#if POLICY_LEVELS /* rows that decisions hold have the bounds of a node */
+#define LOW(row) (s->low[row])
+#define HIGH(row) (s->high[row])
+#else
+#define LOW(row) ((void)s, Y_LOWER[row])
+#define HIGH(row) ((void)s, Y_UPPER[row])
+#endif
+
 /* Return the bound that a row is held at. */
 static real bound(const policy_state *s, int row)
 {
-    return s->kind[row] > 0 ? Y_UPPER[row] : Y_LOWER[row];
+    return s->kind[row] > 0 ? HIGH(row) : LOW(row);
 }
 
 /* Return the size of the terms that a row compares with its bound on a side; the other one, which
    may be far away, has no part in it. */
 static real terms_of(const policy_state *s, int row, real side)
 {
-    return s->size[row] + absolute(side > 0 ? Y_UPPER[row] : Y_LOWER[row]);
+    return s->size[row] + absolute(side > 0 ? HIGH(row) : LOW(row));
 }
 
 /* Return the ends of the interval of a row's multiplier; equal bounds hold it on both sides. */
-static real lowest(int row, int side)
+static real lowest(const policy_state *s, int row, int side)
 {
-    return side > 0 && Y_LOWER[row] < Y_UPPER[row] ? 0 : -W[row];
+    return side > 0 && LOW(row) < HIGH(row) ? 0 : -W[row];
 }
 
-static real highest(int row, int side)
+static real highest(const policy_state *s, int row, int side)
 {
-    return side < 0 && Y_LOWER[row] < Y_UPPER[row] ? 0 : W[row];
+    return side < 0 && LOW(row) < HIGH(row) ? 0 : W[row];
 }
 
 /* The factor: column i of L, from below its unit diagonal. */
@@ -222,7 +230,7 @@ static real longest(const policy_state *s, const real *x, real noise, real most,
     *at = -1;
     for (i = 0; i < s->n_held; i++) {
         int row = s->held[i];
-        real to = x[i] > 0 ? highest(row, s->kind[row]) : lowest(row, s->kind[row]);
+        real to = x[i] > 0 ? highest(s, row, s->kind[row]) : lowest(s, row, s->kind[row]);
         real room = to - s->lambda[row];
         if (absolute(x[i]) > noise && absolute(to) < BIG && absolute(most * x[i]) > absolute(room)) {
             most = larger(0, room / x[i]);
@@ -272,7 +280,7 @@ static int hold(policy_state *s, int row, int side, real excess, int *iterations
         int i, at;
         solve_upper(s, x, s->n_held);
         for (i = 0; i < s->n_held; i++) x[i] *= -sign;
-        own = sign > 0 ? highest(row, side) : lowest(row, side);
+        own = sign > 0 ? highest(s, row, side) : lowest(s, row, side);
         room = absolute(own - s->lambda[row]);
         if (absolute(own) < BIG) most = room;
         step = longest(s, x, NOISE, most, &at, &end);
@@ -305,7 +313,7 @@ static int worst(const policy_state *s, real tolerance, int *side, real *excess,
     for (i = 0; i < POLICY_ROWS; i++) sum += absolute(s->lambda[i]);
     for (i = 0; i < POLICY_ROWS; i++) {
         int kind = s->kind[i];
-        real above = s->y[i] - Y_UPPER[i], below = s->y[i] - Y_LOWER[i], off = 0, size, length;
+        real above = s->y[i] - HIGH(i), below = s->y[i] - LOW(i), off = 0, size, length;
         if (kind == FREE) off = above > 0 ? above : smaller(below, 0);
         else if (kind == SATURATED) off = smaller(above, 0);
         else if (kind == -SATURATED) off = larger(below, 0);
@@ -327,6 +335,18 @@ static int worst(const policy_state *s, real tolerance, int *side, real *excess,
     return found;
 }
 
+#if POLICY_LEVELS
+/* Return the dual objective, relative to the value without multipliers. */
+static real dual(const policy_state *s)
+{
+    real sum = 0;
+    int i;
+    for (i = 0; i < POLICY_ROWS; i++)
+        if (s->lambda[i] != 0) sum += s->lambda[i] * ((s->y_free[i] + s->y[i]) / 2 - bound(s, i));
+    return sum;
+}
+#endif
+
 /* Solve from the multipliers of the state, with rows exact to a tolerance relative to their size. */
 static int solve(policy_state *s, real tolerance, int *iterations)
 {
@@ -337,6 +357,9 @@ static int solve(policy_state *s, real tolerance, int *iterations)
         int row, side = 0, settled;
         settle(s, iterations);
         respond(s);
+#if POLICY_LEVELS
+        if ((s->cost = dual(s)) >= s->cutoff) return POLICY_SOLVED; /* a node that needs no more */
+#endif
         row = worst(s, tolerance, &side, &excess, &settled);
         if (row < 0) { /* judge y without the rounding of its updates */
             respond_anew(s);
@@ -364,14 +387,14 @@ static int certify(const policy_state *s, real v_free, policy_info *info)
     info->gap = 0;
     for (i = 0; i < POLICY_ROWS; i++) sum += absolute(s->lambda[i]);
     for (i = 0; i < POLICY_ROWS; i++) {
-        real y = s->y[i], lambda = s->lambda[i], off = distance(y, Y_LOWER[i], Y_UPPER[i]);
+        real y = s->y[i], lambda = s->lambda[i], off = distance(y, LOW(i), HIGH(i));
         real charge = W[i] < BIG ? W[i] * off : 0;
         if (W[i] >= BIG) {
             info->violation = larger(info->violation, off * UNIT[i]);
-            if (!(off <= FEASIBLE * terms_of(s, i, y - Y_UPPER[i]) + ROUNDING * sum)) holds = 0;
+            if (!(off <= FEASIBLE * terms_of(s, i, y - HIGH(i)) + ROUNDING * sum)) holds = 0;
         }
         if (lambda != 0) {
-            real at = lambda > 0 ? Y_UPPER[i] : Y_LOWER[i];
+            real at = lambda > 0 ? HIGH(i) : LOW(i);
             info->gap += absolute(charge + lambda * (at - y));
             quadratic += lambda * (s->y_free[i] - y) / 2;
         } else {
@@ -447,6 +470,8 @@ static int judge(const real p[], policy_info *info)
     return holds;
 }
 
+/* @LEVELS@ */
+
 /* Forget the active set, but not the last action. */
 static void restart(policy_state *s)
 {
@@ -463,13 +488,17 @@ void policy_reset(policy_state *s)
     int i;
     restart(s);
     for (i = 0; i < POLICY_N_U; i++) s->u[i] = smaller(larger(0, U_LOWER[i]), U_UPPER[i]);
+#if POLICY_LEVELS
+    for (i = 0; i < POLICY_N_U; i++) s->runs[i] = 0;
+    s->hint[0] = -1;
+#endif
 }
 
 int policy_step(policy_state *s, const real p[], real u[], policy_info *info)
 {
     policy_info local;
-    real v_free = 0, value, violation;
-    int i, code, feasible, finite = 1, fresh = 0, cold = 1;
+    real v_free = 0, value = 0, violation, gap = 0;
+    int i, code, feasible, finite = 1, fresh = 0, cold = 1, iterations = 0, found = POLICY_SOLVED;
     if (!info) info = &local;
     info->value = info->gap = info->violation = 0;
     info->iterations = 0;
@@ -480,11 +509,21 @@ int policy_step(policy_state *s, const real p[], real u[], policy_info *info)
         return POLICY_INVALID;
     }
     feasible = judge(p, info);
+#if POLICY_LEVELS
+    found = search(s, info, &value);
+    if (found != POLICY_SOLVED && found != POLICY_NODE_LIMIT) {
+        act(s, p, u);
+        return feasible ? found : POLICY_INFEASIBLE;
+    }
+    info->value += value;
+    gap = info->gap;
+    for (i = 0; i < DECISIONS; i++) s->hint[i] = s->plan[i + ((i + 1) % DECIDED > 0)];
+#endif
     value = info->value;
     violation = info->violation;
     for (i = 0; i < POLICY_ROWS; i++) cold = cold && s->lambda[i] == 0;
     for (;;) { /* from the last active set, with a new factor and tight rows, and from none */
-        code = solve(s, fresh ? TIGHT : TOLERANCE, &info->iterations);
+        code = solve(s, fresh ? TIGHT : TOLERANCE, &iterations);
         info->value = value;
         info->violation = violation;
         if (!certify(s, v_free, info) && code == POLICY_SOLVED) {
@@ -495,13 +534,15 @@ int policy_step(policy_state *s, const real p[], real u[], policy_info *info)
                 continue;
             }
         }
-        if (code == POLICY_SOLVED || cold || info->iterations >= MAX_ITERATIONS) break;
+        if (code == POLICY_SOLVED || cold || iterations >= MAX_ITERATIONS) break;
         restart(s);
         cold = 1;
         fresh = 0;
     }
+    info->gap += gap;
+    info->iterations += iterations;
     act(s, p, u);
-    return feasible ? code : POLICY_INFEASIBLE;
+    return !feasible ? POLICY_INFEASIBLE : code ? code : found;
 }
 
 /* @EXAMPLES@ */

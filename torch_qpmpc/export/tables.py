@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import check_no_levels, check_one_model
+from torch_qpmpc.mpc.validation import check_one_model
 from torch_qpmpc.qp.pipeline.condensing import ENTERS, null_space
 from torch_qpmpc.qp.pipeline.scaling import ROUNDING, lengths
 from torch_qpmpc.qp.program import EVENT_SHAPES, INFINITE, QuadraticProgram, Status, crossed
@@ -62,6 +64,16 @@ class Rows:
         return self.Y, self.lower, self.upper, self.w, self.size, self.unit
 
 
+class Decisions(NamedTuple):
+    """Decisions ``(m, S)``: their rows in the table, values ``(m, S, L)``, and bounds as places."""
+
+    levels: Levels
+    rows: Array
+    values: Array
+    first: Array
+    last: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Tables:
     """The tables of a policy in float64.
@@ -81,6 +93,7 @@ class Tables:
         centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
         usual: ``(n_p,)``, the size of an entry of p whose own cost is a half, one without a cost.
         constants: entries of p with one value only.
+        decisions: those of actions on levels, None without any.
         digest: SHA-256 of the nine tensors of the QP.
     """
 
@@ -103,6 +116,7 @@ class Tables:
     centre: Array
     usual: Array
     constants: dict[int, float]
+    decisions: Decisions | None
     digest: str
 
 
@@ -114,7 +128,6 @@ def make_tables(mpc: QPMPC) -> Tables:
             the plan.
     """
     check_one_model(mpc)
-    check_no_levels(mpc, "C code")
     qp = mpc.quadratic_program()
     H, q, c, C, b, G, lb, ub, w = (x.detach().double().cpu().numpy() for x in qp.tensors())
     _check(qp)
@@ -162,7 +175,11 @@ def make_tables(mpc: QPMPC) -> Tables:
     known = _rows(*map(np.concatenate, pairs))
     u = slice(n_p, n_p + n_u)
     u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
-    of_u, own = units[u], H.diagonal()[:n_p]
+    of_u, own, decisions = units[u], H.diagonal()[:n_p], None
+    if levels := mpc.levels:
+        at = np.searchsorted(on_plan, levels.rows)
+        values = levels.values[:, None] - (G[on_plan] @ z_0)[at, None]
+        decisions = Decisions(levels, at, values / unit[at, None], *levels.within(lb, ub))
     return Tables(
         n_p,
         n_u,
@@ -183,6 +200,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         _centre(qp, n_p, mpc.constants),
         np.where(own > 0, own, 1.0) ** -0.5,
         mpc.constants,
+        decisions,
         digest(qp),
     )
 

@@ -37,6 +37,7 @@ CONSTANTS = {
         "FEASIBLE": "1e-8",
         "KNOWN_FEASIBLE": "1e-6",
         "GAP": "1e-9",
+        "GAIN": "1e-9",
         "COARSE": "1e-7",
     },
     "float32": {
@@ -50,6 +51,7 @@ CONSTANTS = {
         "FEASIBLE": "1e-4f",
         "KNOWN_FEASIBLE": "1e-5f",
         "GAP": "1e-4f",
+        "GAIN": "1e-5f",
         "COARSE": "1e-4f",
     },
 }
@@ -99,6 +101,7 @@ def sources(tables: Tables, settings: Settings, header: str, examples: Examples)
             for key, size in sizes_of(tables, settings).items()
         ),
         "/* @TABLES@ */": _tables(tables, settings),
+        "/* @LEVELS@ */": filled("levels.c", settings.name) if tables.decisions else "",
         "/* @EXAMPLES@ */": _examples(tables, settings, examples),
     }
     return {f"{settings.name}.{end}": filled(f"policy.{end}", settings.name, parts) for end in "hc"}
@@ -123,6 +126,8 @@ def header(mpc: QPMPC, tables: Tables, settings: Settings) -> str:
     lines = [
         f"{settings.name}: the policy and value of a quadratic program, by torch_qpmpc "
         f"{version} on {today.isoformat()}.",
+        f"The state has @BYTES@ bytes. A QP takes at most {settings.max_iterations} iterations.",
+        *[f"A step solves at most {x.levels.max_nodes + 1}." for x in [tables.decisions] if x],
         f"SHA-256 of H, q, c, C, b, G, lb, ub, w: {tables.digest}",
         "",
         *(f"{_entries('p', *ends[i : i + 2])}: {name}" for i, name in enumerate(names)),
@@ -162,7 +167,7 @@ def factored(tables: Tables, settings: Settings) -> bool:
 def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
     """Return the sizes in the header, by the macro's name without the prefix."""
     r, d, most = len(tables.rows), tables.R.shape[1], held(tables)
-    return {
+    sizes = {
         "N_P": tables.n_p,
         "N_U": tables.n_u,
         "ROWS": r,
@@ -174,14 +179,21 @@ def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
         "TRIANGLE": max(most * (most + 1) // 2, 1),
         "FACTORED": int(factored(tables, settings)),
         "WORK": d if factored(tables, settings) else 0,
+        "LEVELS": 0,
     }
+    if tables.decisions:
+        levels, (m, S) = tables.decisions.levels, tables.decisions.rows.shape
+        sizes |= {"LEVELS": m, "DECIDED": S, "DECISIONS": m * S, "NODES": levels.max_nodes}
+        depth, runs = m * S * (levels.values.shape[1] - 1) + 1, max(levels.rules.sum(1))
+        sizes |= {"DEPTH": depth, "RUNS": runs}
+    return sizes
 
 
 def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
     """Return the constant arrays by their names in C."""
     P = np.tril(tables.P, -1) + np.diag(np.diag(tables.P)) / 2
     rows, known = tables.rows, tables.known
-    return {
+    arrays = {
         "Y_P": rows.Y,
         "Y_LOWER": rows.lower,
         "Y_UPPER": rows.upper,
@@ -202,6 +214,16 @@ def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
         "V_PP": P[np.tril_indices(len(P))],
         "V_P": tables.g,
     }
+    if tables.decisions:
+        values = tables.decisions.values.reshape(-1, tables.decisions.values.shape[-1])
+        near = float(CONSTANTS[settings.dtype]["GAIN"].rstrip("f")) * np.ptp(values, axis=-1)
+        arrays |= {"LEVEL": values, "ON_LEVEL": near, "START_COST": tables.decisions.levels.starts}
+    return arrays
+
+
+def integers(name: str, x: Any, kind: str = "int") -> str:
+    """Return the definition of a constant array of integers, ``(n,)``."""
+    return f"static const {kind} {name}[] = {{{', '.join(map(str, x)) or 0}}};"
 
 
 def _tables(tables: Tables, settings: Settings) -> str:
@@ -210,6 +232,12 @@ def _tables(tables: Tables, settings: Settings) -> str:
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     lines += [array(name, x, dtype) for name, x in arrays_of(tables, settings).items()]
     lines.append(f"static const real V_OFFSET = {number(tables.c, dtype)};")
+    if tables.decisions:
+        levels, rows, _, first, last = tables.decisions
+        own = {"LEVEL_ACTION": levels.actions, "LEAST_STEPS": levels.rules, "LEVEL_ROW": rows}
+        lines += [integers(key, x.ravel()) for key, x in own.items()]
+        own = {"FIRST": first, "LAST": last}
+        lines += [integers(key, x.ravel(), "signed char") for key, x in own.items()]
     return "\n".join(lines)
 
 

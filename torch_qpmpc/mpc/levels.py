@@ -9,6 +9,7 @@ best plan is unique.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.kernels import levels as kernel
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, prepared_for
+from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.solve import report, solve_programs
 from torch_qpmpc.qp.program import UNKNOWN, QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
@@ -36,8 +37,8 @@ CURVATURE = 1e-7
 STATUSES = np.array([Status.SOLVED, Status.NODE_LIMIT, Status.INFEASIBLE, Status.NOT_CONVERGED])
 #: What has no use without levels.
 DEFAULTS = {"min_on": 1, "min_off": 1, "start_cost": 0.0, "integer_horizon": None}
-#: The most levels of an action, which are the bits of a mask.
-MOST = 60
+#: The most levels of an action, whose places are bytes in C.
+MOST = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Levels:
     Attributes:
         actions: the places of the actions in u, ``(m,)``.
         rows: the row of G that each decision holds, ``(m, S)``.
-        values: ascending levels, ``(m, L)``, of which the first ``counts`` ``(m,)`` are used.
+        values: ascending levels, ``(m, L)``; the highest one fills the row.
         rules: the fewest steps off and on, ``(m, 2)``.
         starts: the costs of going on, ``(m, S)``.
         max_nodes: the most nodes of a search.
@@ -56,7 +57,6 @@ class Levels:
     actions: np.ndarray
     rows: np.ndarray
     values: np.ndarray
-    counts: np.ndarray
     rules: np.ndarray
     starts: np.ndarray
     max_nodes: int
@@ -84,61 +84,39 @@ class Levels:
             raise QPError.expected("integer_horizon", f"{S}", f"at most the horizon {N}")
         actions = np.flatnonzero([bool(x) for x in bounds.action_levels])
         given = [bounds.action_levels[a] for a in actions]
-        values = np.zeros((len(given), max(map(len, given))))
-        for own, levels in zip(values, given, strict=True):
-            own[: len(levels)] = levels
-        own_rows, first = bounds.level_rows or [-1] * n_u, N * layout.n + layout.n_x
-        rows = np.array(
-            [
-                [k * layout.n + layout.n_x + a, first + k * layout.n_mixed + own_rows[a]][
-                    own_rows[a] >= 0
-                ]
-                for a in actions
-                for k in range(S)
-            ]
-        ).reshape(len(actions), S)
+        most = max(map(len, given))
+        values = np.array([[*own, *own[-1:] * (most - len(own))] for own in given])
+        own, k, mixed = bounds.level_rows, np.arange(S), N * layout.n + layout.n_x
+        rows = (k * layout.n + layout.n_x + a for a in actions)
+        if own is not None:
+            rows = (mixed + k * layout.n_mixed + own[a] for a in actions)
+        rows = np.stack([*rows])
         if not scheme.theta["w"][rows].isinf().all():
             remedy = "Leave action_slack out, or inf for these actions."
-            raise QPError.expected(
-                "action_slack", "a price", "hard bounds of actions on levels", remedy
-            )
-        numbers = {
-            "min_off": bounds.min_off,
-            "min_on": bounds.min_on,
-            "start_cost": bounds.start_cost,
-        }
-        off, on, cost = (_numbers(name, x, n_u)[actions] for name, x in numbers.items())
+            want = "hard bounds of actions on levels"
+            raise QPError.expected("action_slack", "a price", want, remedy)
+        names = "min_off", "min_on", "start_cost"
+        off, on, cost = (_numbers(x, getattr(bounds, x), n_u)[actions] for x in names)
         for name, steps in (("min_off", off), ("min_on", on)):
             for x in steps:
                 check_whole(name, float(x) if x % 1 else int(x), 1)
         rules = np.stack((off, on), -1).astype(np.int64)
         starts = cost[:, None] * scheme.gamma ** np.arange(S)
-        counts = np.array([len(x) for x in given])
-        return cls(actions, rows, values, counts, rules, starts, bounds.max_nodes)
+        return cls(actions, rows, values, rules, starts, bounds.max_nodes)
 
     @property
     def identity(self) -> list[Any]:
         """What values depend on, as lists."""
-        parts = self.values, self.counts, self.rows, self.rules, self.starts
+        parts = self.values, self.rows, self.rules, self.starts
         return [x.tolist() for x in parts] + [self.max_nodes]
 
     def solve(
-        self,
-        qp: QuadraticProgram,
-        fixed: Tensor,
-        n_kept: int,
-        solver: str,
-        on_failure: str,
-        runs: np.ndarray | None = None,
-        hint: np.ndarray | None = None,
+        self, qp: QuadraticProgram, fixed: Tensor, n_kept: int, solver: str, on_failure: str
     ) -> QPSolution:
         """Return the best plan's solution, whose value contains the costs of starts.
 
-        Args:
-            qp, fixed, n_kept, solver, on_failure: as in `torch_qpmpc.qp.solve.solve`.
-            runs: for how many steps each action was on, or with a minus off, ``(*batch, m)``; by
-                default 0, unknown: then the first stage counts as no switch.
-            hint: places of levels ``(*batch, m, S)`` that may be good, such as the last plan's.
+        The past is unknown: the first stage counts as no switch. Arguments are those of
+        `torch_qpmpc.qp.solve.solve`.
 
         Returns:
             The solution, with the number of nodes as ``iterations``. With the status ``NODE_LIMIT``
@@ -150,24 +128,14 @@ class Levels:
             raise QPError.expected("action_levels", "a traced call", want)
         with torch.no_grad():
             programs, batch = Programs.of(*(x.detach().cpu() for x in theta), n_kept=n_kept)
-            m, S = self.rows.shape
-            B = len(programs)
-            runs = np.zeros((B, m), np.int64) if runs is None else runs.reshape(B, m)
-            hint = np.full((B, m, S), -1) if hint is None else hint.reshape(B, m, S)
-            places, active, costs, outcomes, nodes, gaps = self.search(programs, runs, hint)
-        found, n_g = places[:, 0, 0] >= 0, qp.lb.shape[-1]
-        values = np.take_along_axis(self.values[None].repeat(B, 0), places.clip(0), -1)
-        held = torch.zeros(B, n_g, dtype=torch.bool)
-        level = torch.zeros(B, n_g, dtype=torch.float64)
-        reduced = programs.prepared.reduced(programs.n_f).rows
-        free = torch.from_numpy(np.isin(self.rows.ravel(), reduced))  # not u_0 of Q
-        level[:, self.rows.ravel()] = torch.from_numpy(values.reshape(B, -1))
-        held[:, self.rows.ravel()] = torch.from_numpy(found)[:, None] & free
-        held, level = (x.reshape(*batch, n_g).to(qp.lb.device) for x in (held, level))
-        level = level.to(qp.lb.dtype)
-        lb, ub = torch.where(held, level, qp.lb), torch.where(held, level, qp.ub)
-        best = replace(qp, lb=lb, ub=ub, check_values=False)
-        start = torch.from_numpy(active).reshape(*batch, n_g).to(qp.lb.device)
+            B, (m, S) = len(programs), self.rows.shape
+            places, active, costs, outcomes, nodes, gaps = self.search(
+                programs, np.zeros((B, m), np.int64), np.full((B, m, S), -1)
+            )
+        found = places[:, 0, 0] >= 0
+        free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
+        best = self.held(qp, np.where(free, places, -1), batch)
+        start = torch.from_numpy(active).reshape(*batch, -1).to(qp.lb.device)
         solution = solve(best, fixed, n_kept, solver, "mask", start)
         status = solution.status.reshape(-1).cpu().numpy().copy()
         status = np.where((status == 0) | ~found, STATUSES[outcomes], status)
@@ -186,7 +154,7 @@ class Levels:
         known = F.pad(fixed.detach(), (0, qp.n_z - fixed.shape[-1])).expand_as(solution.z)
         parts = {name: getattr(solution, name) for name in ("chi", "lam", "xi")}
         parts = {name: torch.where(lost[..., None], 0.0, x) for name, x in parts.items()}
-        gap = torch.from_numpy(gaps * capped).reshape(batch).to(to, qp.q.dtype)
+        gap = torch.from_numpy(np.where(capped, gaps, 0.0)).reshape(batch).to(to, qp.q.dtype)
         return replace(
             solution,
             **parts,
@@ -199,17 +167,38 @@ class Levels:
             iterations=torch.from_numpy(nodes).reshape(batch).to(to),
         )
 
+    def held(
+        self, qp: QuadraticProgram, places: np.ndarray, batch: Sequence[int]
+    ) -> QuadraticProgram:
+        """Return the QPs with decisions at the ``places`` ``(B, m, S)``; -1 leaves their bounds."""
+        at = torch.from_numpy(places).to(qp.lb.device).reshape(*batch, *self.rows.shape)
+        values = torch.from_numpy(self.values).to(qp.lb).expand(*batch, -1, -1)
+        level, sides = values.gather(-1, at.clamp(min=0)), []
+        for side in (qp.lb, qp.ub):
+            side = side.expand(*batch, -1).clone()
+            side[..., self.rows] = torch.where(at < 0, side[..., self.rows], level)
+            sides.append(side)
+        return replace(qp, lb=sides[0], ub=sides[1], check_values=False)
+
+    def within(self, lb: np.ndarray, ub: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the first and the last level within bounds of rows ``(*batch, n_g)``.
+
+        They are places ``(*batch, m, S)``, the last one below the first if there is none.
+        """
+        lower, upper = (side[..., self.rows, None] for side in (lb, ub))
+        room = kernel.TOLERANCE * np.abs(values := self.values[:, None])
+        inside = (lower - room <= values) & (values <= upper + room)
+        inside[..., 1:] &= np.diff(values) > 0
+        last = inside.shape[-1] - 1 - inside[..., ::-1].argmax(-1)
+        return np.where(inside.any(-1), inside.argmax(-1), inside.shape[-1]), last
+
     def search(
         self, programs: Programs, runs: np.ndarray, hint: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """Return places of the levels, active sets, costs of starts, outcomes, nodes and gaps."""
-        prepared, n_f, theta, group = (
-            programs.prepared,
-            programs.n_f,
-            programs.theta,
-            programs.group,
-        )
-        qps, of, least = programs.reduced_qps(), prepared.reduced(n_f).rows, 0.0
+        prepared, n_f, theta = programs.prepared, programs.n_f, programs.theta
+        group, qps = programs.group, programs.reduced_qps()
+        of, least = prepared.reduced(n_f).rows, 0.0
         if prepared.sizes(n_f).shift.any() and (slope := np.abs(qps.g).max(initial=0.0)) > 0:
             # A power of two, as each is kept.
             least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / np.abs(self.values).max()))
@@ -225,14 +214,17 @@ class Levels:
         place = np.full(theta.G.shape[1], -1)
         place[of] = np.arange(len(of))
         rows = place[self.rows]
-        given = np.einsum("bmi,bi->bm", theta.G[group][:, self.rows[:, 0], :n_f], programs.fixed)
-        off = np.abs(given[:, :, None] - self.values)
-        reach = self.values[np.arange(len(self.counts)), self.counts - 1] - self.values[:, 0]
-        off[:, np.arange(off.shape[2]) >= self.counts[:, None]] = np.inf
-        fixed = np.where(off.min(-1) <= ON_LEVEL * reach, off.argmin(-1), -1)
+        given = self.rows[rows < 0]  # those of u_0 in Q, whose level is known
+        known = np.einsum("bri,bi->br", theta.G[group][:, given, :n_f], programs.fixed)
+        near = ON_LEVEL * np.ptp(self.values, axis=-1)[(rows < 0).any(-1)]
+        lb, ub = (
+            np.array(np.broadcast_to(x, (len(group), x.shape[1]))) for x in (theta.lb, theta.ub)
+        )
+        lb[:, given], ub[:, given] = known - near, known + near
+        first, last = self.within(lb, ub)
         places, lam, costs, outcomes, nodes, gaps = kernel.search(
-            K, unit, group, free, lower, upper, w, rows, self.values, self.counts, self.rules,
-            self.starts, runs, fixed, hint, self.max_nodes,
+            K, unit, group, free, lower, upper, w, rows, self.values, self.rules,
+            self.starts, runs, first, last, hint, self.max_nodes,
         )  # fmt: skip
         active = np.zeros((len(group), theta.G.shape[1]), np.int8)
         saturated = np.abs(lam) >= (1 - kernel.GAIN) * w
@@ -243,46 +235,55 @@ class Levels:
 
 
 class Searches:
-    """Searches for the best plan with a theta at rest, one after the other, in NumPy alone.
+    """Searches for the best plan with a theta at rest, one after the other, in NumPy alone."""
 
-    ``n_kept`` and ``solver`` are those of `torch_qpmpc.qp.solve.solve`.
-    """
-
-    def __init__(self, levels: Levels, qp: QuadraticProgram, n_kept: int, solver: str) -> None:
-        self._levels, self._solver = levels, solver
-        self._prepared = prepared_for([to_numpy(x.detach()) for x in qp.tensors()], n_kept)
+    @torch.no_grad()
+    def __init__(self, mpc: Any) -> None:
+        self._levels, self._solver = mpc.levels, mpc.solver
+        theta = [to_numpy(x) for x in mpc.quadratic_program().tensors()]
+        self._prepared = prepared_for(theta, mpc.n_p + mpc.n_u)
 
     def solve(
-        self, fixed: np.ndarray, runs: np.ndarray, hint: np.ndarray | None = None
+        self, fixed: np.ndarray, runs: np.ndarray | None = None, hint: np.ndarray | None = None
     ) -> tuple[BatchSolution, np.ndarray]:
         """Return the best plan's solution, and the places of its levels ``(m, S)``.
 
         Args:
             fixed: the first entries of z, ``(1, n_f)``.
-            runs, hint: as in `Levels.solve`, ``(m,)`` and ``(m, S)``.
+            runs: for how many steps each action was on, or with a minus off, ``(n_u,)``; 0, the
+                default, is unknown.
+            hint: places of levels ``(m, S)`` that may be good, such as the last plan's.
         """
-        levels, programs = self._levels, self._of(fixed, self._prepared)
+        levels, programs = self._levels, Programs(self._prepared, np.zeros(1, np.int64), fixed)
+        runs = np.zeros(len(levels.rows), np.int64) if runs is None else runs[levels.actions]
         hint = np.full(levels.rows.shape, -1) if hint is None else hint
         places, active, _, (outcome,), *_ = levels.search(programs, runs[None], hint[None])
         if outcome not in (kernel.BEST, kernel.CAPPED):
             return programs.unsolved(int(STATUSES[outcome])), places[0]
-        solution = self.held(fixed, places[0], active)
+        solution = self._held(fixed, places[0], active)
         if not solution.status[0]:
             solution.status[0] = STATUSES[outcome]
         return solution, places[0]
 
-    def held(
+    def held(self, fixed: np.ndarray, u: np.ndarray, ahead: np.ndarray | None) -> BatchSolution:
+        """Return the solution with the action u and then the levels ``ahead``, ``(m, S)``.
+
+        Multipliers of decisions are zero.
+        """
+        assert ahead is not None
+        first = np.abs(u[self._levels.actions, None] - self._levels.values).argmin(1)
+        solution = self._held(fixed, np.column_stack((first, ahead[:, :-1])))
+        solution.lam[0, self._levels.rows] = 0.0
+        return solution
+
+    def _held(
         self, fixed: np.ndarray, places: np.ndarray, active: np.ndarray | None = None
     ) -> BatchSolution:
-        """Return the solution of the QP that is held at the levels of a plan, ``(m, S)``."""
         lb, ub = self._prepared.theta.lb.copy(), self._prepared.theta.ub.copy()
         rows, values = self._levels.rows, self._levels.values
         lb[:, rows] = ub[:, rows] = np.take_along_axis(values, places, 1)
-        programs = self._of(fixed, self._prepared.bounded(lb, ub))
+        programs = Programs(self._prepared.bounded(lb, ub), np.zeros(1, np.int64), fixed)
         return solve_programs(programs, self._solver, active)
-
-    def _of(self, fixed: np.ndarray, prepared: Prepared) -> Programs:
-        return Programs(prepared, np.zeros(1, np.int64), fixed)
 
 
 def check_used(levels: str, given: dict[str, Any]) -> None:

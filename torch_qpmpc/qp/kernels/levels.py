@@ -42,22 +42,7 @@ BEST, CAPPED, NONE, UNKNOWN = 0, 1, 2, 3
 
 @compiled
 def search(
-    K,
-    unit,
-    group,
-    free,
-    lower,
-    upper,
-    w,
-    rows,
-    values,
-    counts,
-    rules,
-    starts,
-    runs,
-    fixed,
-    hint,
-    cap,
+    K, unit, group, free, lower, upper, w, rows, values, rules, starts, runs, lows, highs, hint, cap
 ):
     """Return the best plans on levels of B QPs.
 
@@ -66,13 +51,12 @@ def search(
         unit: the units of the rows, ``(M, r)``.
         group: the index of each QP's K, ``(B,)``.
         free, lower, upper, w: ``(B, r)``.
-        rows: the row of each decision ``(m, S)``, -1 for one that is ``fixed``.
+        rows: the row of each decision ``(m, S)``, -1 for one that is fixed.
         values: ascending levels, ``(m, L)``.
-        counts: the number of levels of each action, ``(m,)``.
         rules: the fewest steps off and on, ``(m, 2)``.
         starts: the costs of starts, ``(m, S)``.
         runs: steps on, or minus steps off, before the plan; 0 if unknown, ``(B, m)``.
-        fixed: the levels of decisions without a row, ``(B, m)``, -1 for none.
+        lows, highs: the lowest and highest level of each decision by place, ``(B, m, S)``.
         hint: levels that may be good ``(B, m, S)``, -1 for none.
         cap: the most nodes.
 
@@ -87,100 +71,74 @@ def search(
     gaps, costs = np.zeros(B), np.zeros(B)
     low, high, lam, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
     side, held, factor = np.zeros(r, np.int64), np.empty(r + 1, np.int64), np.empty((r + 1, r + 1))
-    masks, pattern = np.empty((m, S), np.int64), np.empty((m, S), np.int64)
-    n = rules.sum(1).max()
-    ahead, ends = np.empty((S + 1, n)), np.empty((2, n), np.bool_)
-    most = S * (counts - 1).sum() + 1
-    at, kept, rest = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
-    bounds = np.empty(most)
-    levels, base = np.empty((m, S, values.shape[1])), np.empty((m, S), np.int64)
+    first, last = np.empty((m, S), np.int64), np.empty((m, S), np.int64)
+    pattern, ahead = np.empty((m, S), np.int64), np.empty((S + 1, rules.sum(1).max()))
+    most = m * S * (values.shape[1] - 1) + 1
+    at, cut, bounds = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
+    above, untried = np.empty(most, np.bool_), np.empty(most, np.bool_)
+    levels, near = np.empty((m, S, values.shape[1])), np.empty((m, S))
     for i in range(B):
         for a in range(m):
             for k in range(S):
-                j, base[a, k] = rows[a, k], 0
-                if j < 0 and fixed[i, a] >= 0:
-                    base[a, k] = 1 << fixed[i, a]
-                for e in range(counts[a] if j >= 0 else 0):
-                    levels[a, k, e] = values[a, e] / unit[group[i], j]
-                    room = TOLERANCE * abs(levels[a, k, e])
-                    if lower[i, j] - room <= levels[a, k, e] <= upper[i, j] + room:
-                        base[a, k] |= 1 << e
-        for j in range(r):
-            low[j], high[j], lam[j], side[j] = lower[i, j], upper[i, j], 0.0, 0
+                levels[a, k] = values[a] / (unit[group[i], rows[a, k]] if rows[a, k] >= 0 else 1.0)
+                near[a, k] = ON_LEVEL * (levels[a, k, -1] - levels[a, k, 0])
+        low[:], high[:], lam[:], side[:] = lower[i], upper[i], 0.0, 0
         n, depth, best, limit, hinted = 0, 0, np.inf, np.inf, hint[i, 0, 0] >= 0
         while True:
             nodes[i] += 1
-            for a in range(m):
-                for k in range(S):
-                    masks[a, k] = base[a, k]
-                    if hinted:
-                        masks[a, k] &= 1 << hint[i, a, k]
+            first[:], last[:] = lows[i], highs[i]
+            if hinted:
+                first[:], last[:] = np.maximum(first, hint[i]), np.minimum(last, hint[i])
             for e in range(depth):
-                masks[at[e] // S, at[e] % S] &= kept[e]
-            cost, of_starts, least, branch = 0.0, 0.0, np.inf, -1
-            for a in range(m):
-                cost += _allowed(masks, a, rules, starts, runs[i, a], ahead, ends)
+                a, k = at[e] // S, at[e] % S
+                if above[e]:
+                    first[a, k] = max(first[a, k], cut[e] + 1)
+                else:
+                    last[a, k] = min(last[a, k], cut[e])
+            cost, least, branch = _allowed(first, last, rules, starts, runs[i], ahead), np.inf, -1
             if cost < limit:
                 for a in range(m):
                     for k in range(S):
-                        j = rows[a, k]
-                        if j >= 0:
-                            low[j], high[j] = _ends(masks[a, k], levels, a, k, counts[a])
+                        if rows[a, k] >= 0:
+                            low[rows[a, k]] = levels[a, k, first[a, k]]
+                            high[rows[a, k]] = levels[a, k, last[a, k]]
                 n, least = _solve(
-                    K[group[i]],
-                    free[i],
-                    low,
-                    high,
-                    w[i],
-                    lam,
-                    y,
-                    side,
-                    held,
-                    n,
-                    factor,
-                    x,
-                    limit - cost,
-                )
+                    K[group[i]], free[i], low, high, w[i],
+                    lam, y, side, held, n, factor, x, limit - cost,
+                )  # fmt: skip
             if least + cost < limit:
-                for k in range(S):
-                    for a in range(m):
-                        if branch < 0:
-                            at_y = y[rows[a, k]] if rows[a, k] >= 0 else np.nan
-                            pattern[a, k], on = _nearest(masks[a, k], levels, a, k, counts[a], at_y)
-                            branch = -1 if on else a * S + k
+                branch = _undecided(first, last, levels, near, rows, y, pattern, False)
                 if branch < 0:
-                    for a in range(m):
-                        of_starts += _allowed(pattern, a, rules, starts, runs[i, a], ahead, ends)
+                    of_starts = _allowed(pattern, pattern, rules, starts, runs[i], ahead)
                     if least + of_starts < limit:
                         best, costs[i] = least + of_starts, of_starts
                         limit = best - GAIN * abs(best)
-                        lams[i] = lam
-                        for a in range(m):
-                            for k in range(S):
-                                plans[i, a, k] = _place(pattern[a, k])
-                    for k in range(S if of_starts > cost else 0):
-                        for a in range(m):
-                            if branch < 0 and masks[a, k] & (masks[a, k] - 1):
-                                branch = a * S + k
+                        lams[i], plans[i] = lam, pattern
+                    if of_starts > cost:
+                        branch = _undecided(first, last, levels, near, rows, y, pattern, True)
             if hinted:
                 hinted = False
                 continue
             if branch >= 0:
                 a, k = branch // S, branch % S
-                first, second = _split(masks[a, k], levels, a, k, counts[a], y[rows[a, k]])
-                at[depth], kept[depth], rest[depth] = branch, first, second
+                at_y, own = y[rows[a, k]], first[a, k]
+                for e in range(own + 1, last[a, k]):
+                    own = e if levels[a, k, e] <= at_y else own
+                middle = (levels[a, k, own] + levels[a, k, own + 1]) / 2
+                at[depth], cut[depth], untried[depth] = branch, own, True
+                above[depth] = at_y > middle + near[a, k]  # rounding decides no tie
                 bounds[depth] = least + cost
                 depth += 1
             if nodes[i] >= cap:
                 break
             if branch < 0:
-                while depth and (rest[depth - 1] == 0 or bounds[depth - 1] >= limit):
+                while depth and (not untried[depth - 1] or bounds[depth - 1] >= limit):
                     depth -= 1
                 if not depth:
                     break
-                kept[depth - 1], rest[depth - 1] = rest[depth - 1], 0
+                above[depth - 1], untried[depth - 1] = not above[depth - 1], False
         for e in range(depth):
-            if rest[e] or e == depth - 1:
+            if untried[e] or e == depth - 1:
                 gaps[i] = max(gaps[i], best - bounds[e])
         found, open_ = best < np.inf, depth > 0
         outcomes[i] = (CAPPED if open_ else BEST) if found else (UNKNOWN if open_ else NONE)
@@ -188,98 +146,82 @@ def search(
 
 
 @compiled
-def _place(mask):
-    """Return the lowest level of a mask."""
-    place = 0
-    while not mask >> place & 1:
-        place += 1
-    return place
+def _undecided(first, last, levels, near, rows, y, pattern, any_):
+    """Return the first decision by stages, of those with several levels left, that is on none.
 
-
-@compiled
-def _ends(mask, levels, a, k, count):
-    """Return the lowest and the highest level of a mask."""
-    first, last = _place(mask), count - 1
-    while not mask >> last & 1:
-        last -= 1
-    return levels[a, k, first], levels[a, k, last]
-
-
-@compiled
-def _nearest(mask, levels, a, k, count, y):
-    """Return the level of a mask that is nearest to y, as a mask, and True if y is on it.
-
-    A y of NaN is that of a fixed decision. A level alone is held, to the tolerance of a row.
+    With ``any_`` it is the first of those with several, and -1 if there is none. ``pattern`` gets
+    the nearest levels. A level alone is held, to the tolerance of a row.
     """
-    best, off = 0, np.inf
-    for e in range(count):
-        if mask >> e & 1 and (best == 0 or abs(levels[a, k, e] - y) < off):
-            best, off = 1 << e, abs(levels[a, k, e] - y)
-    alone = mask & (mask - 1) == 0
-    return best, alone or not off > ON_LEVEL * (levels[a, k, count - 1] - levels[a, k, 0])
+    found = -1
+    for k in range(pattern.shape[1]):
+        for a in range(len(pattern)):
+            best = first[a, k]
+            if best < last[a, k]:
+                at = y[rows[a, k]]
+                for e in range(best + 1, last[a, k] + 1):
+                    if abs(levels[a, k, e] - at) < abs(levels[a, k, best] - at):
+                        best = e
+                if found < 0 and (any_ or abs(levels[a, k, best] - at) > near[a, k]):
+                    found = a * pattern.shape[1] + k
+            pattern[a, k] = best
+    return found
 
 
 @compiled
-def _split(mask, levels, a, k, count, y):
-    """Return the levels of a mask on y's side of the gap that it is in, and the others."""
-    below = mask & -mask
-    for e in range(count):
-        if mask >> (e + 1) and levels[a, k, e] <= y:
-            below |= mask & (1 << e)
-    above = mask & ~below
-    _, top = _ends(below, levels, a, k, count)
-    bottom, _ = _ends(above, levels, a, k, count)
-    return (below, above) if y - top <= bottom - y else (above, below)
-
-
-@compiled
-def _next(state, on, rule):
-    """Return the state after a step on or off, -1 if a minimum time forbids it.
+def _next(state, on, rule, first, last):
+    """Return the state after a step on or off, -1 if that is not left to it.
 
     The states are 1, .., rule[0] steps off, then 1, .., rule[1] steps on, the last of each or more.
     """
-    off, last = rule[0], rule[0] + rule[1] - 1
+    off, n = rule[0], rule[0] + rule[1]
+    if first > last or (last == 0 if on else first > 0):
+        return -1
     if on:
-        return min(state + 1, last) if state >= off else off if state == off - 1 else -1
-    return min(state + 1, off - 1) if state < off else 0 if state == last else -1
+        return min(state + 1, n - 1) if state >= off else off if state == off - 1 else -1
+    return min(state + 1, off - 1) if state < off else 0 if state == n - 1 else -1
 
 
 @compiled
-def _allowed(masks, a, rules, starts, run, ahead, ends):
-    """Take from the masks of an action what no sequence allows; return the least cost of starts.
+def _allowed(firsts, lasts, rules, starts, runs, ahead):
+    """Take from decisions what no sequence allows; return the least cost of starts, or inf.
 
-    ``ahead`` ``(S + 1, n)`` and ``ends`` ``(2, n)`` are scratch.
+    ``ahead`` ``(S + 1, n)`` is scratch: the least cost of a sequence to each state.
     """
-    S, off, n, rule = masks.shape[1], rules[a, 0], rules[a, 0] + rules[a, 1], rules[a]
-    if n == 2 and not starts[a].any():
-        return 0.0 if masks[a].all() else np.inf
-    ahead[:, :] = np.inf  # the least cost of a sequence to each state
-    if run <= 0:
-        ahead[0, off - 1 if run == 0 else min(-run, off) - 1] = 0.0
-    if run >= 0:
-        ahead[0, n - 1 if run == 0 else off + min(run, rule[1]) - 1] = 0.0
-    for k in range(S):
+    total, S = 0.0, firsts.shape[1]
+    for a in range(len(firsts)):
+        rule, first, last, run, cost = rules[a], firsts[a], lasts[a], runs[a], np.inf
+        off, n = rule[0], rule[0] + rule[1]
+        ahead[:, :] = np.inf
+        if run <= 0:
+            ahead[0, off - 1 if run == 0 else min(-run, off) - 1] = 0.0
+        if run >= 0:
+            ahead[0, n - 1 if run == 0 else off + min(run, rule[1]) - 1] = 0.0
+        for k in range(S):
+            for s in range(n):
+                for on in range(2 if ahead[k, s] < np.inf else 0):
+                    to = _next(s, on, rule, first[k], last[k])
+                    if to >= 0:
+                        by = starts[a, k] if on and s < off else 0.0
+                        ahead[k + 1, to] = min(ahead[k + 1, to], ahead[k, s] + by)
         for s in range(n):
-            for on in range(2 if ahead[k, s] < np.inf else 0):
-                to = _next(s, on, rule) if masks[a, k] & (~1 if on else 1) else -1
-                if to >= 0:
-                    cost = ahead[k, s] + (starts[a, k] if on and s < off else 0.0)
-                    ahead[k + 1, to] = min(ahead[k + 1, to], cost)
-    least = np.inf
-    for s in range(n):
-        least = min(least, ahead[S, s])
-        ends[S & 1, s] = ahead[S, s] < np.inf  # the end may be reached from the state
-    for k in range(S - 1 if least < np.inf else -1, -1, -1):
-        may = 0
-        for s in range(n):
-            ends[k & 1, s] = False
-            for on in range(2 if ahead[k, s] < np.inf else 0):
-                to = _next(s, on, rule) if masks[a, k] & (~1 if on else 1) else -1
-                if to >= 0 and ends[(k + 1) & 1, to]:
-                    ends[k & 1, s] = True
-                    may |= ~1 if on else 1
-        masks[a, k] &= may
-    return least
+            cost = min(cost, ahead[S, s])
+        if cost == np.inf:
+            return np.inf
+        for k in range(S - 1, -1, -1):  # inf from where the end is not reached
+            off_ends, on_ends = False, False
+            for s in range(n):
+                ends = False
+                for on in range(2 if ahead[k, s] < np.inf else 0):
+                    to = _next(s, on, rule, first[k], last[k])
+                    if to >= 0 and ahead[k + 1, to] < np.inf:
+                        ends = True
+                        off_ends, on_ends = off_ends or not on, on_ends or on == 1
+                if not ends:
+                    ahead[k, s] = np.inf
+            first[k] = first[k] if off_ends else max(first[k], 1)
+            last[k] = last[k] if on_ends else 0
+        total += cost
+    return total
 
 
 @compiled
@@ -350,8 +292,9 @@ def _solve(K, free, low, high, w, lam, y, side, held, n, factor, x, cutoff):
 
     The cost is inf without a plan, and at least ``cutoff`` if the node ends early.
     """
-    r = len(free)
-    a = 0
+    r, a = len(free), 0
+    for j in range(r):
+        side[j] = 0 if side[j] == 3 else side[j]
     while a < n:  # the levels may have changed
         j = held[a]
         side[j] = 1 if lam[j] > 0 else -1 if lam[j] < 0 else side[j]
