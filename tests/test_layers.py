@@ -29,7 +29,7 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 410,
+    ".": 413,
     "analysis": 851,
     "control": 4746,
     "envs": 1440,
@@ -37,7 +37,7 @@ BUDGET = {
     "export": 1515,
     "learning": 2842,  # models that did not train theta decide in improve
     "identification": 2425,
-    "mpc": 3665,
+    "mpc": 4117,  # nonlinear MPC, which blended.py is to pay for
     "proofs": 1001,
     "qp": 5877,
     "study": 550,

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.mpc.layout import Layout
     from torch_qpmpc.mpc.model import Model
     from torch_qpmpc.mpc.module import QPMPC
+    from torch_qpmpc.mpc.nonlinear import RungeKutta
     from torch_qpmpc.mpc.scheme import Scheme
     from torch_qpmpc.qp.pipeline.solve import SolveLog
     from torch_qpmpc.qp.program import QuadraticProgram, Status
@@ -48,6 +49,7 @@ __all__ = [
     "QPError",
     "QPQLearningLoss",
     "QuadraticProgram",
+    "RungeKutta",
     "Scheme",
     "SolveLog",
     "SolverError",
@@ -82,6 +84,7 @@ if not TYPE_CHECKING:
         "QPMPC": "torch_qpmpc.mpc.module:QPMPC",
         "QPQLearningLoss": "torch_qpmpc.learning.q_learning:QPQLearningLoss",
         "QuadraticProgram": "torch_qpmpc.qp.program:QuadraticProgram",
+        "RungeKutta": "torch_qpmpc.mpc.nonlinear:RungeKutta",
         "Scheme": "torch_qpmpc.mpc.scheme:Scheme",
         "SolveLog": "torch_qpmpc.qp.pipeline.solve:SolveLog",
         "Status": "torch_qpmpc.qp.program:Status",

@@ -5,7 +5,7 @@ All values are costs to go, as in the paper; rewards appear only in `torch_qpmpc
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,15 +26,17 @@ from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
+from torch_qpmpc.mpc.nonlinear import PlanSolution, SequentialQP, at_origin
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
-from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, Scheme, check_names
+from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, MODELS, Scheme, check_names
 from torch_qpmpc.mpc.stage_cost import fit_rewards, scheme_cost
 from torch_qpmpc.mpc.state import KIND, check_identity, check_own, encoded, identity, reduce, stored
 from torch_qpmpc.mpc.validation import (
     CONSTRAINTS,
     COST,
     STRUCTURES,
+    check_dynamics,
     check_learn,
     check_no_levels,
     check_one_model,
@@ -81,6 +83,12 @@ class QPMPC(nn.Module):
         solver, on_failure: see `solve_qp`.
         schedule: a model from `identify_blended`, or its arguments. Its linearisation at s replaces
             the scheme's model: theta gets the differences of C(s) and b(s) from the scheme's.
+        dynamics: the function x+ = f(x, u) that replaces the scheme's model, or f(x, u, d) with a
+            preview, of tensors ``(*batch, n_x)``, ``(*batch, n_u)`` and ``(*batch, n_d)``; it may
+            return the pair of x+ and a stage cost ``(*batch,)``, which is added to theta's. V is
+            then a local minimum, see `torch_qpmpc.mpc.nonlinear`. A module's parameters are
+            learned, too; C and b are not. `of` linearises f at the origin for A and B.
+        iterations: the most QPs of a call with ``dynamics``; 1 is real-time iteration.
 
     Attributes:
         scheme: the `Scheme` that theta starts from.
@@ -88,6 +96,7 @@ class QPMPC(nn.Module):
         levels: the `Levels` of its actions; None without any. V is then the minimum over plans on
             levels, and its gradient that of the best plan's QP.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
+        sequential: the `SequentialQP` of the dynamics; None without any.
         schedule: the `BlendedModel`, a copy of the one passed; None without one.
         n_p: the number of entries of p, (N + 1) n_d + n_x.
 
@@ -139,12 +148,16 @@ class QPMPC(nn.Module):
         solver: str = "proxqp",
         on_failure: str = "raise",
         schedule: BlendedModel | Mapping[str, Tensor] | None = None,
+        dynamics: Callable[..., Any] | None = None,
+        iterations: int = 30,
     ) -> None:
         super().__init__()
         check_kind("scheme", scheme, Scheme, "QPMPC.from_model takes A and B.")
         check_choice("structure", structure, STRUCTURES)
         check_choice("on_failure", on_failure, ON_FAILURE)
         check_step(step)
+        if dynamics is not None and learn is LEARN:
+            learn = tuple(x for x in LEARN if x != "C")
         check_learn(learn, structure, scheme.layout.n_linear)
         backend(solver)
         self.scheme, self.layout = scheme, scheme.layout
@@ -155,6 +168,10 @@ class QPMPC(nn.Module):
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
         self.schedule = None if schedule is None else schedule_of(schedule, self.layout)
+        check_dynamics(dynamics, learn, scheme.bounds.action_levels)
+        self.sequential = None
+        if dynamics is not None:
+            self.sequential = SequentialQP(dynamics, self.layout, self.gamma, iterations)
         with torch.device("cpu"):
             self._start(learn)
         if (device := torch.get_default_device()).type != "cpu":
@@ -194,7 +211,9 @@ class QPMPC(nn.Module):
         Raises:
             QPError: an argument is missing or invalid.
         """
-        own = {x: options.pop(x) for x in (*KEYWORDS, "schedule") if x in options}
+        own = {x: options.pop(x) for x in (*KEYWORDS, *MODELS) if x in options}
+        if own.get("dynamics") is not None and options.get("A") is None:
+            options |= at_origin(own["dynamics"], Layout(n_x, n_u, 1, n_d))
         return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
 
     @classmethod
@@ -351,7 +370,8 @@ class QPMPC(nn.Module):
         Args:
             s: states ``(*batch, n_x)`` or, with more known, p ``(*batch, n_p)``.
             a: actions ``(*batch, n_u)``.
-            warm_start: see `solve_qp`.
+            warm_start: see `solve_qp`; with dynamics, a plan ``(*batch, N, n_u)`` or the
+                `PlanSolution` that has one, which is what this returns then.
             qp: the `quadratic_program` of the current theta, if available, or one with residuals.
 
         Raises:
@@ -369,10 +389,12 @@ class QPMPC(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return pi(s), and the active set ``(*batch, n_g)`` as the next step's ``warm_start``.
 
-        ``qp`` is as in `solve`.
+        With dynamics, the latter is a plan that begins one step later, ``(*batch, N n_u)``. ``qp``
+        is as in `solve`.
         """
         solution = self.solve(s, warm_start=warm_start, qp=qp)
-        return self._action(solution, s.dtype), solution.active
+        next_start = solution.later if isinstance(solution, PlanSolution) else solution.active
+        return self._action(solution, s.dtype), next_start
 
     def predicted(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states ``(*batch, N + 1, n_x)`` and actions ``(*batch, N, n_u)`` of a plan.
@@ -468,10 +490,13 @@ class QPMPC(nn.Module):
         A symbolic link at ``path`` is replaced. Later releases read the file.
 
         Raises:
-            QPError: a part has a parametrization that is not QPMPC's own.
+            QPError: a part has a parametrization that is not QPMPC's own, or there are dynamics.
             OSError: writing failed; the old file is unchanged.
         """
         check_own("save", self)
+        if self.sequential is not None:
+            remedy = "Save the state_dict, and load it into a QPMPC with the same dynamics."
+            raise QPError.expected("save", "dynamics, which are code", "A and B", remedy)
         save_file(path, KIND, stored(self))
 
     @classmethod
@@ -571,6 +596,9 @@ class QPMPC(nn.Module):
         learn = {name: self._masks.get(name, True) for name in self.learned}
         names = ("structure", "step", "solver", "on_failure")
         options = {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
+        if self.sequential is not None:
+            options["dynamics"] = self.sequential.dynamics
+            options["iterations"] = self.sequential.iterations
         return options if self.schedule is None else options | {"schedule": self.schedule.arguments}
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -627,6 +655,8 @@ class QPMPC(nn.Module):
         if self.schedule is not None:
             qp = self._scheduled(qp, fixed[..., : self.n_p])
         on_failure = on_failure or self.on_failure
+        if self.sequential is not None:
+            return self.sequential.solve(qp, fixed, n_kept, self.solver, on_failure, warm_start)
         if self.levels is not None:
             return self.levels.solve(qp, fixed, n_kept, self.solver, on_failure)
         return solve(qp, fixed, n_kept, self.solver, on_failure, warm_start)
@@ -643,7 +673,7 @@ class QPMPC(nn.Module):
         From none, it does not depend on earlier calls, so that a resumed run repeats it. The
         preparation is kept until theta changes; it is None, too, if that cannot be seen.
         """
-        if self.schedule is not None or self.levels is not None:
+        if any(x is not None for x in (self.schedule, self.levels, self.sequential)):
             return None
         leaves, at_rest = vars(self).get("_at_rest", (None, None))
         if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:
@@ -667,6 +697,8 @@ class QPMPC(nn.Module):
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP."""
+        if isinstance(solution, PlanSolution) and self.on_failure != "mask":
+            solution.warn()
         return solution.z[..., self.n_p : self.n_p + self.n_u].to(dtype)
 
     def _parametrizations_for(self, name: str, value: Tensor) -> list[nn.Module]:

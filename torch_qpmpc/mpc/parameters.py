@@ -98,10 +98,10 @@ def groups(
     if not isinstance(rates, Mapping):
         got = type(rates).__name__
         raise QPError.expected("rates", got, "a mapping such as {'cost': .., 'constraints': ..}")
-    known = {*COST, *CONSTRAINTS, "cost", "constraints"}
+    known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
     if unknown := set(rates) - known:
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
-    if unused := set(rates) - {*learned, "cost", "constraints"}:
+    if unused := set(rates) - {*learned, "cost", "constraints", "dynamics"}:
         expected = f"parts that are learned: {', '.join(learned) or 'none'}"
         raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
     result = []
@@ -113,6 +113,8 @@ def groups(
             )
         check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
         result.append({"params": leaves(module, part), "lr": rate, "name": part})
+    if "dynamics" in rates and (own := list(getattr(module.sequential, "parameters", list)())):
+        result.append({"params": own, "lr": rates["dynamics"], "name": "dynamics"})
     return result
 
 
@@ -221,6 +223,8 @@ def for_each(
 
 
 def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
+    if part in ("C", "b") and module.sequential is not None:
+        return {}  # the dynamics take their place
     if not parametrize.is_parametrized(module, part):
         learned = part in module._parameters
         return {} if part in SIGNED and not learned else {part: getattr(module, part)}

@@ -22,6 +22,8 @@ from torch_qpmpc.mpc.model import Model
 GAMMA = 0.9
 #: Keyword arguments of `QPMPC` that no scheme has.
 KEYWORDS = ("learn", "structure", "step", "solver", "on_failure")
+#: Those of models in place of A and B.
+MODELS = ("schedule", "dynamics", "iterations")
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +176,7 @@ def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
     return C_0, theta
 
 
-def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, "schedule")) -> None:
+def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, *MODELS)) -> None:
     """Raise `TypeError` unless these are names of arguments of `Scheme.of`, or ``also`` known."""
     own = {x.name for part in (Model, Cost, Bounds) for x in fields(part)}
     known = {"blocks", "gamma", "constants", *SIZES}

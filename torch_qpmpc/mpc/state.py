@@ -44,6 +44,7 @@ def identity(mpc: Any) -> dict[str, Any]:
         "learn": {x: digest(mpc._masks[x]) if x in mpc._masks else True for x in mpc.learned},
         "hard rows": digest(mpc.scheme.theta["w"].isinf()),
         "action_levels": mpc.levels and repr(mpc.levels.identity),
+        "dynamics": None if mpc.sequential is None else type(mpc.sequential.dynamics).__name__,
         "centres": None if mpc.schedule is None else len(mpc.schedule.centres),
     }
 

@@ -62,14 +62,29 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
 
 
 def check_one_model(mpc: Any) -> None:
-    """Raise `QPError` if a QPMPC has a schedule, so that its C and b differ between states."""
+    """Raise `QPError` if a QPMPC has a schedule or dynamics, so that its C and b depend on s."""
+    if mpc.sequential is not None:
+        want = "one with A and B, for one C"
+        raise QPError.expected("mpc", "one with dynamics", want, "mpc.C is that of the origin.")
     if mpc.schedule is not None:
         got, want = "one with a schedule", "one with the same C and b for all states"
         raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
 
 
+def check_dynamics(dynamics: Any, learn: Collection[str], levels: Any) -> None:
+    """Raise `QPError` if dynamics are to have what needs A and B."""
+    if dynamics is not None:
+        if levels is not None:
+            raise QPError.expected("action_levels", "levels beside dynamics", "none")
+        for part in {"C", "b"} & {*learn}:
+            got, want = f"{part!r} beside dynamics", "other parts: the dynamics take its place"
+            raise QPError.expected("learn", got, want, "A module's parameters are learned.")
+
+
 def check_no_levels(mpc: Any, what: str) -> None:
-    """Raise `QPError` if actions of a QPMPC take levels, for ``what`` needs one QP."""
+    """Raise `QPError` if a QPMPC has levels or dynamics, for ``what`` needs one QP."""
+    if mpc.sequential is not None:
+        raise QPError.expected("mpc", "one with dynamics", f"one with A and B, for {what}")
     if mpc.levels is not None:
         got, want = "one with action_levels", f"one without, for {what}"
         remedy = "A scheme with action_levels=None has the relaxed plan."

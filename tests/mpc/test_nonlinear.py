@@ -1,0 +1,287 @@
+"""Nonlinear MPC: simulations, the search for plans, its status, and gradients of V, Q and pi."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.testing import assert_close
+
+import torch_qpmpc as qm
+from tests.transitions import transitions
+from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.learning.operators import QPActorValueOperator, warm_policy
+from torch_qpmpc.learning.q_learning import QPQLearningLoss
+from torch_qpmpc.mpc.nonlinear import PlanSolution
+from torch_qpmpc.proofs import Polytope, largest_difference
+
+N = 5
+LEARN = ("H", "H_f", "q", "c", "lb", "ub", "w")
+
+
+class Pendulum(nn.Module):
+    """A pendulum with a torque, a known load if ``known``, and a stage cost if ``priced``."""
+
+    def __init__(self, known: bool = False, priced: bool = False) -> None:
+        super().__init__()
+        self.gravity = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+        self.price = nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+        self.known, self.priced = known, priced
+        self.step = qm.RungeKutta(self.rates, 0.1, steps=2)
+
+    def rates(self, x: Tensor, u: Tensor, *d: Tensor) -> Tensor:
+        angle, rate = x.unbind(-1)
+        load = d[0][..., 0] * angle.cos() if self.known else 0.0
+        return torch.stack((rate, self.gravity * angle.sin() - 0.2 * rate + u[..., 0] + load), -1)
+
+    def forward(self, x: Tensor, u: Tensor, *d: Tensor) -> Any:
+        after = self.step(x, u, *d)
+        cost = self.price * (1 - x[..., 0].cos()) + 0.1 * u[..., 0].sin() ** 4
+        return (after, cost) if self.priced else after
+
+
+def made(known: bool = False, priced: bool = False, **options: Any) -> QPMPC:
+    options = {"iterations": 100, "learn": LEARN, "action_bounds": ([-1.5], [1.5])} | options
+    options = {"stage_weight": [1.0, 0.1, 0.1], "solver": "daqp"} | options
+    options = {"dynamics": Pendulum(known, priced)} | options
+    return QPMPC.of(2, 1, N, int(known), **options)
+
+
+def states(mpc: QPMPC, count: int = 4, size: float = 0.6, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return size * torch.randn(count, mpc.n_p, generator=generator, dtype=torch.float64)
+
+
+def test_runge_and_kutta_are_of_fourth_order():
+    x, u = torch.ones(3, 1).double(), torch.zeros(3, 1).double()
+    errors = [
+        (qm.RungeKutta(lambda x, u: u - x, 1.0, steps)(x, u) - torch.tensor(-1.0).exp()).abs().max()
+        for steps in (2, 4)
+    ]
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
+    with pytest.raises(QPError, match="steps: got 0"):
+        qm.RungeKutta(lambda x, u: x, 0.1, steps=0)
+
+
+def test_linear_dynamics_have_the_solution_of_the_qp():
+    A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double(), torch.tensor([[0.0], [0.5]]).double()
+    options: Any = {"stage_weight": [1.0, 0.1, 0.1], "action_bounds": ([-0.3], [0.3])}
+    options |= {"learn": (), "solver": "daqp", "state_bounds": ([-9.0, -0.2], [9.0, 0.2])}
+    linear = QPMPC.of(2, 1, N, A=A, B=B, offset=[0.01, 0.0], **options)
+    offset = torch.tensor([0.01, 0.0]).double()
+    mpc = QPMPC.of(2, 1, N, dynamics=lambda x, u: x @ A.T + u @ B.T + offset, **options)
+    assert_close(mpc.C_0, linear.C_0)
+    assert_close(mpc.b, linear.b)
+    s, a = states(mpc), torch.full((4, 1), 0.1).double()
+    assert_close(mpc.value(s), linear.value(s))
+    assert_close(mpc.action_value(s, a), linear.action_value(s, a))
+    assert_close(mpc.policy(s), linear.policy(s), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("priced", [False, True])
+def test_a_converged_plan_is_a_local_minimum_of_the_simulated_cost(priced):
+    mpc = made(priced=priced)
+    s = states(mpc)
+    solution = mpc.solve(s)
+    assert isinstance(solution, PlanSolution)
+    assert solution.converged.all()
+    assert solution.strict is not None
+    assert solution.strict.all()
+    assert solution.defect.max() < 1e-6
+    assert solution.residual.max() < 1e-6
+    qp, search = mpc.quadratic_program(), mpc.sequential
+    assert search is not None
+
+    def cost(u: Tensor) -> Tensor:
+        z, costs = search.simulated(s, u)
+        return costs + (z @ qp.H * z).sum(-1) / 2
+
+    with torch.no_grad():
+        assert_close(cost(solution.plan), solution.value, rtol=1e-6, atol=1e-8)
+        for seed in range(20):
+            change = torch.randn(4, N, 1, generator=torch.Generator().manual_seed(seed)).double()
+            other = (solution.plan + 0.03 * change).clamp(-1.5, 1.5)
+            assert (cost(other) >= solution.value - 1e-8).all()
+
+
+CASES: list[dict[str, Any]] = [
+    {},
+    {"priced": True},
+    {"known": True},
+    {"known": True, "priced": True, "gamma": 1.0},
+    {"state_bounds": ([-1.0, -0.4], [1.0, 0.4]), "state_slack": 5.0},
+    {"state_bounds": ([-9.0, -0.8], [9.0, 0.8]), "state_slack": torch.inf},
+    {"blocks": (1, 2, 2)},
+]
+
+
+def slope_along(function: Any, point: list[Tensor], change: list[Tensor]) -> Tensor:
+    """Return the central difference of a function's sum, with the point moved in place."""
+    sides = []
+    with torch.no_grad():
+        start = [x.clone() for x in point]
+        for eps in (1e-5, -1e-5, 0.0):
+            for x, x_0, dx in zip(point, start, change, strict=True):
+                x.copy_(x_0 + eps * dx)
+            sides.append(function().sum() if eps else None)
+    return (sides[0] - sides[1]) / 2e-5
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: ", ".join(case) or "plain")
+@pytest.mark.parametrize("place", ["random", "origin", "at bounds"])
+def test_gradients_equal_finite_differences(case, place):
+    mpc = made(**case)
+    s = states(mpc, 3, {"random": 0.3, "origin": 0.0, "at bounds": 0.9}[place], seed=4)
+    if case.get("state_slack") == torch.inf:
+        s *= 0.5  # from which the bounds can be kept
+    a = torch.tensor([[0.2], [-0.7], [1.0]]).double()
+    functions = {
+        "V": lambda: mpc.value(s),
+        "Q": lambda: mpc.action_value(s, a),
+        "pi": lambda: mpc.policy(s),
+    }
+    of_theta, generator = [*mpc.parameters()], torch.Generator().manual_seed(1)
+    for name, function in functions.items():
+        for point in ([s.requires_grad_()], of_theta):
+            change = [torch.randn(x.shape, generator=generator).to(x) for x in point]
+            found = torch.autograd.grad(function().sum(), point, allow_unused=True)
+            pairs = zip(found, change, strict=True)
+            own = torch.stack([(x * dx).sum() for x, dx in pairs if x is not None]).sum()
+            other = slope_along(function, point, change)
+            assert_close(own, other, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+
+
+def test_a_saddle_says_that_the_plan_has_no_gradient():
+    def hilltop(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return x + 0.1 * u, 1e6 * x[..., 0] ** 4 - x[..., 0] ** 2
+
+    options: Any = {"stage_weight": [0.0, 1e-3], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
+    mpc = QPMPC.of(1, 1, 4, dynamics=hilltop, **options)
+    s = torch.tensor([[0.0], [0.05]]).double().requires_grad_()
+    solution = mpc.solve(s)
+    assert solution.converged.all()
+    assert solution.strict.tolist() == [False, True]
+    with pytest.warns(RuntimeWarning, match="1 of 2 plans have a gradient of zero"):
+        gradient = torch.autograd.grad(mpc.policy(s).sum(), s)[0]
+    assert gradient[0] == 0
+    assert gradient[1] != 0
+    assert gradient.isfinite().all()
+    mpc.on_failure = "mask"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mpc.policy(s)
+
+
+def test_a_plan_is_an_argument_and_a_result():
+    mpc = made(iterations=1)
+    s = states(mpc, size=1.5)
+    with torch.no_grad():
+        first = mpc.solve(s)
+        again = mpc.solve(s, warm_start=first)
+        flat = mpc.solve(s, warm_start=first.plan.flatten(1))
+        assert_close(again.plan, flat.plan)
+        assert (again.value <= first.value + 1e-9).all()
+        assert (again.value < first.value).any()
+        assert first.later.equal(torch.cat((first.plan[:, 1:], first.plan[:, -1:]), 1)[..., 0])
+        one = mpc.solve(s[0], warm_start=first.plan[0])
+        assert one.plan.shape == (N, 1)
+        assert one.converged.shape == ()
+        assert_close(one.plan, again.plan[0])
+        nested = mpc.solve(s.view(2, 2, 2), warm_start=first.plan)
+        assert_close(nested.z.flatten(0, 1), again.z)
+        nothing = mpc.solve(s, warm_start=torch.full_like(first.plan, torch.nan))
+        assert_close(nothing.plan, first.plan)
+    with pytest.raises(QPError, match=r"warm_start: got shape \(3,\)"):
+        mpc.solve(s, warm_start=torch.zeros(3))
+
+
+def test_real_time_iteration_swings_a_pendulum_up():
+    torch.set_default_dtype(torch.float64)
+    try:
+        model = Pendulum().requires_grad_(False)
+
+        def f(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+            return model(x, u), 1 - x[..., 0].cos() + 0.01 * x[..., 1] ** 2
+
+        bounds: Any = ([-1.2], [1.2])  # less than gravity
+        mpc = QPMPC.of(
+            2, 1, 25, dynamics=f, iterations=1, gamma=1.0, action_bounds=bounds,
+            stage_weight=[0.0, 0.0, 1e-3], solver="daqp", learn=(),
+        )  # fmt: skip
+        policy, x = warm_policy(mpc), torch.tensor([[torch.pi, 0.0], [2.0, 0.0]])
+        for _ in range(100):
+            x = model(x, policy(x))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert (x[:, 0].cos() > 0.99).all()
+    assert (x[:, 1].abs() < 0.1).all()
+
+
+def test_q_learning_moves_the_parameters_of_the_dynamics():
+    mpc = made(iterations=20, on_failure="mask")
+    loss = QPQLearningLoss(QPActorValueOperator(mpc), delay_value=True)
+    loss(transitions(8))["loss_value"].backward()
+    gradient = mpc.get_parameter("sequential.dynamics.gravity").grad
+    assert gradient is not None
+    assert gradient != 0
+    groups = mpc.parameter_groups({"cost": 1e-2, "constraints": 1e-3, "dynamics": 1e-4})
+    assert groups[-1]["name"] == "dynamics"
+    assert len(groups[-1]["params"]) == 2
+
+
+def test_copies_pickles_and_states_are_whole():
+    mpc = made(iterations=5)
+    s = states(mpc)
+    with torch.no_grad():
+        mpc.get_parameter("sequential.dynamics.gravity").fill_(1.5)
+        for twin in (copy.deepcopy(mpc), pickle.loads(pickle.dumps(mpc))):
+            assert_close(twin.value(s), mpc.value(s))
+        fresh = made(iterations=5)
+        fresh.load_state_dict(mpc.state_dict())
+        assert_close(fresh.value(s), mpc.value(s))
+        assert_close(torch.from_numpy(mpc.predict(s.numpy())), mpc.policy(s))
+    with pytest.raises(QPError, match="save: got dynamics, which are code"):
+        mpc.save("unused.qpmpc")
+    linear = QPMPC.of(
+        2, 1, N, A=torch.eye(2), B=torch.ones(2, 1), stage_weight=[1.0] * 3, learn=LEARN
+    )
+    with pytest.raises(QPError, match="dynamics = 'Pendulum'"):
+        linear.load_state_dict(mpc.state_dict())
+
+
+def test_what_needs_one_model_refuses_dynamics():
+    mpc = made()
+    calls = [
+        lambda: mpc.at_rest(),
+        lambda: mpc.model(),
+        lambda: qm.export_c(mpc, "unused"),
+        lambda: largest_difference(mpc, mpc, Polytope.box([-1.0] * 2, [1.0] * 2)),
+    ]
+    for call in calls:
+        with pytest.raises(QPError, match="got one with dynamics, expected one with A and B"):
+            call()
+    with pytest.raises(QPError, match="residuals: got 'C'"):
+        mpc.quadratic_program({"C": torch.zeros_like(mpc.C)})
+    with pytest.raises(QPError, match="dynamics: got a traced call"):
+        torch.func.grad(lambda s: mpc.value(s).sum())(states(mpc))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dynamics": 3}, "dynamics: got 3, expected a function"),
+        ({"dynamics": lambda x, u: x[0]}, "x\\+ and l of shapes"),
+        ({"dynamics": lambda x, u: (x, x)}, "x\\+ and l of shapes"),
+        ({"iterations": 0}, "iterations: got 0"),
+        ({"learn": ("C",)}, "learn: got 'C' beside dynamics"),
+        ({"action_levels": [[0.0, 1.0]]}, "action_levels: got levels beside dynamics"),
+    ],
+)
+def test_invalid_arguments_are_errors(options, message):
+    with pytest.raises(QPError, match=message):
+        made(**options)

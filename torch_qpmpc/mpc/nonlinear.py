@@ -1,0 +1,399 @@
+"""Nonlinear MPC: any function x+ = f(x, u, d) as the model, by sequential quadratic programming.
+
+V(s) is a local minimum, over plans u_0, .., u_{N-1}, of theta's cost and f's stage cost l,
+
+    1/2 z'Hz + q'z + c + w'sigma + sum_k gamma^k l(x_k, u_k, d_k),  x_{k+1} = f(x_k, u_k, d_k),
+
+with the rows of theta. The QP along a plan has f's Jacobians as A_k, B_k and E_k, and the positive
+parts of l's Hessians (Gauss and Newton), with a proximal term (Levenberg and Marquardt). Its step,
+shortened until the cost and the priced violations of hard rows fall, leads to the next plan. All
+plans are simulations of f.
+
+Where this converges, the QP's multipliers are those of the nonlinear program. They give the
+gradient of V, and the QP's KKT system that of the plan, with the Hessian of the Lagrangian, f's
+curvature included, in place of H (Fiacco, 1976).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torch_qpmpc.checks import check_whole
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout, banded_matrix
+from torch_qpmpc.qp.batching import times
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.solve import report
+from torch_qpmpc.qp.program import NDIMS, QuadraticProgram
+from torch_qpmpc.qp.solution import QPSolution, active_rows
+from torch_qpmpc.qp.solve import Eager, solve
+from torch_qpmpc.qp.tracing import is_eager
+
+#: The number of random plans, and for how many steps they hold an action.
+RANDOM, HOLD = 16, 5
+#: The fractions of a step that are tried.
+FRACTIONS = (1.0, 0.5, 0.2, 0.04)
+#: The proximal term in terms of H's diagonal: first, least, most, and its change by each QP.
+FIRST, LEAST, MOST, CHANGE = 1e-2, 1e-9, 1e4, 4.0
+#: A converged plan's step, and a rise of the cost that is rounding, relatively.
+SETTLED, ROUNDING = 1e-7, 1e-11
+#: The price of a hard row's violation, relative to its largest multiplier.
+PRICE = 2.0
+#: The least eigenvalue of a definite Hessian, relatively.
+DEFINITE = 1e-9
+#: The parts of a `QPSolution` besides its QP.
+PARTS = [*QPSolution.__annotations__][1:]
+
+
+class RungeKutta(nn.Module):
+    """The state after ``dt`` of x' = derivative(x, u) or derivative(x, u, d): `QPMPC`'s dynamics.
+
+    Args:
+        derivative: x' ``(*batch, n_x)`` of x, u and d with these leading dimensions.
+        dt: the time between two actions.
+        steps: the number of equal steps, of fourth order.
+
+    Example:
+        >>> import torch, torch_qpmpc as qm
+        >>> f = qm.RungeKutta(lambda x, u: u - x, dt=0.1)
+        >>> f(torch.ones(1), torch.zeros(1))  # exp(-0.1)
+        tensor([0.9048])
+    """
+
+    def __init__(self, derivative: Callable[..., Tensor], dt: float, steps: int = 1) -> None:
+        super().__init__()
+        check_whole("steps", steps, 1)
+        self.derivative, self.dt, self.steps = derivative, dt, steps
+
+    def forward(self, x: Tensor, *others: Tensor) -> Tensor:
+        """Return the next state after x; the ``others`` are u, and d if there is a preview."""
+        h = self.dt / self.steps
+        for _ in range(self.steps):
+            k_1 = self.derivative(x, *others)
+            k_2 = self.derivative(x + h / 2 * k_1, *others)
+            k_3 = self.derivative(x + h / 2 * k_2, *others)
+            k_4 = self.derivative(x + h * k_3, *others)
+            x = x + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
+        return x
+
+
+@dataclass(frozen=True, repr=False)
+class PlanSolution(QPSolution):
+    """The solution of the last QP along a plan, or that plan where it has not converged.
+
+    Attributes:
+        plan: the actions ``(*batch, N, n_u)``, a ``warm_start`` of the same state.
+        converged: True where the last QP left its plan in place, ``(*batch,)``.
+        defect: the largest of |x_{k+1} - f(x_k, u_k, d_k)| in z, ``(*batch,)``.
+        strict: True where the Lagrangian's Hessian is positive definite in all directions that the
+            active rows leave free, ``(*batch,)``; elsewhere only the value has a gradient, and
+            others are zero. None if no gradient is recorded.
+    """
+
+    plan: Tensor
+    converged: Tensor
+    defect: Tensor
+    strict: Tensor | None
+
+    @property
+    def later(self) -> Tensor:
+        """The plan one step later, ``(*batch, N n_u)``, which repeats its last action."""
+        return torch.cat((self.plan[..., 1:, :], self.plan[..., -1:, :]), -2).flatten(-2)
+
+    def warn(self) -> None:
+        """Warn of plans without a gradient, if gradients are recorded."""
+        if self.strict is not None and (count := int((~self.strict).sum())):
+            text = f"{count} of {self.strict.numel()} plans have a gradient of zero: the Hessian of"
+            text += " the Lagrangian is not positive definite along their active rows"
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
+
+
+class Known(Eager):
+    """A known solution as a function of the QP that it solves; it is the last argument."""
+
+    @staticmethod
+    def forward(*arguments: Any) -> tuple[Tensor, ...]:
+        return arguments[-1]
+
+
+class SequentialQP(nn.Module):
+    """The search for plans, and the QPs along them.
+
+    Args:
+        dynamics: f, see `QPMPC`.
+        layout: the sizes.
+        gamma: the discount of stage costs.
+        iterations: the most QPs of a call with a plan.
+    """
+
+    entries: Tensor
+    C: Tensor
+    held: Tensor
+    powers: Tensor
+
+    def __init__(
+        self, dynamics: Callable[..., Any], layout: Layout, gamma: float, iterations: int = 1
+    ) -> None:
+        super().__init__()
+        if not callable(dynamics):
+            raise QPError.expected("dynamics", repr(dynamics), "a function f(x, u) of tensors")
+        check_whole("iterations", iterations, 1)
+        self.dynamics, self.layout, self.iterations = dynamics, layout, iterations
+        self.sizes = layout.n_d, layout.n_x, layout.n_u
+        zero = torch.zeros(layout.n_x, layout.n_d + layout.n, dtype=torch.float64)
+        E, A, B = zero.split(self.sizes, -1)
+        after, cost = self.stage(*zero.expand(2, -1, -1).split(self.sizes, -1))
+        shapes = tuple(after.shape), (2, len(zero)) if cost is None else tuple(cost.shape)
+        if shapes != (want := ((2, *A.shape), (2, len(zero)))):
+            remedy = "Index the last dimension: x[..., 0]."
+            raise QPError.expected("dynamics", f"x+ and l of shapes {shapes}", f"{want}", remedy)
+        k = torch.arange(layout.horizon)
+        d, plan = (first + n * k for first, n in ((0, layout.n_d), (layout.n_preview, layout.n)))
+        columns = [x.unsqueeze(1) + torch.arange(n) for x, n in ((d, layout.n_d), (plan, layout.n))]
+        self.register_buffer("entries", torch.cat(columns, 1), persistent=False)
+        self.register_buffer("C", banded_matrix(A, B, layout.horizon, E), persistent=False)
+        self.register_buffer("powers", float(gamma) ** k.double(), persistent=False)
+        held = k.masked_fill(layout.repeating, 0).cummax(0).values
+        self.register_buffer("held", held, persistent=False)
+
+    def stage(self, d: Tensor, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Return the next x, and the stage cost if there is one."""
+        out = self.dynamics(x, u, d) if self.layout.n_d else self.dynamics(x, u)
+        return out if isinstance(out, tuple) else (out, None)
+
+    def outputs(self, w: Tensor) -> Tensor:
+        """Return [x+, l] ``(.., n_x + 1)`` of w = [d, x, u]."""
+        after, cost = self.stage(*w.split(self.sizes, -1))
+        cost = w.new_zeros(w.shape[:-1]) if cost is None else cost
+        return torch.cat((after, cost.unsqueeze(-1)), -1).to(w)
+
+    def simulated(self, p: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """Return z ``(.., n_z)`` of plans u ``(.., N, n_u)`` from p, and the sums of l."""
+        layout, p = self.layout, p.expand(*u.shape[:-2], -1)
+        d = p[..., : layout.n_preview].unflatten(-1, (layout.horizon + 1, layout.n_d)).unbind(-2)
+        x, costs, states = p[..., layout.n_preview :], [], []
+        for d_k, u_k in zip(d[:-1], u.unbind(-2), strict=True):
+            x, cost = self.stage(d_k, x, u_k)
+            states.append(x.to(u))
+            costs += [] if cost is None else [cost.to(u)]
+        z = torch.cat((p, torch.cat((u, torch.stack(states, -2)), -1).flatten(-2)), -1)
+        return z, torch.stack(costs, -1) @ self.powers if costs else z.new_zeros(z.shape[:-1])
+
+    def curvature(self, w: Tensor, weights: Tensor) -> Tensor:
+        """Return the Hessians of ``weights``'[x+, l] in w, ``(.., n, n)``."""
+
+        def slope(w: Tensor) -> Tensor:
+            out = self.outputs(w)
+            options = {"create_graph": True, "materialize_grads": True}
+            return torch.autograd.grad(out, w, weights.expand_as(out), **options)[0]
+
+        W = _jacobian(slope, w, w.shape[-1])[1].detach()
+        return (W + W.mT) / 2
+
+    def along(self, qp: QuadraticProgram, z: Tensor, chi: Tensor | None = None) -> QuadraticProgram:
+        """Return the QP along z ``(B, n_z)``.
+
+        With multipliers ``chi`` of a solution z, it has the derivatives of the nonlinear program:
+        H is the Lagrangian's Hessian, and other parts depend on the parameters of the dynamics.
+        """
+        w, powers, n_c = z.detach()[:, self.entries], self.powers.unsqueeze(-1), len(self.C)
+        out, J = _jacobian(self.outputs, w, self.layout.n_x + 1, chi is not None)
+        of_x, of_l = J[..., :-1, :], J[..., -1, :]
+        C = self.C.unflatten(0, (len(powers), -1)).expand(len(z), -1, -1, -1)
+        C = C.scatter(-1, self.entries.unsqueeze(1).expand_as(of_x), of_x).flatten(1, 2)
+        b = (times(of_x, w) - out[..., :-1]).flatten(1)
+        C = torch.cat((C, qp.C[..., n_c:, :].expand(len(z), -1, -1)), 1)  # rows of blocks
+        b = torch.cat((b, qp.b[..., n_c:].expand(len(z), -1)), 1)
+        q, H, whole = powers * of_l, None, qp.H.expand(len(z), -1, -1).clone()
+        c = self.powers * out[..., -1] - (w * q).sum(-1)
+        if chi is not None:
+            chi = chi[:, :n_c].detach().unflatten(1, (len(powers), -1))
+            H = self.curvature(w, torch.cat((chi, powers.expand(len(z), -1, 1)), -1))
+        elif of_l.any():
+            weights = F.pad(powers, (self.layout.n_x, 0)).expand_as(out)
+            values, vectors = torch.linalg.eigh(self.curvature(w, weights))
+            H = (vectors * values.clamp(min=0).unsqueeze(-2)) @ vectors.mT
+            q, c = q - times(H, w), c + (w * times(H, w)).sum(-1) / 2
+        if H is not None:
+            whole[:, self.entries.unsqueeze(-1), self.entries.unsqueeze(-2)] += H
+        q = qp.q + torch.zeros_like(z).index_copy(1, self.entries.flatten(), q.flatten(1))
+        return replace(qp, H=whole, q=q, c=qp.c + c.sum(-1), C=C, b=b, check_values=False)
+
+    def solve(
+        self,
+        qp: QuadraticProgram,
+        fixed: Tensor,
+        n_kept: int,
+        solver: str,
+        on_failure: str,
+        warm_start: Any = None,
+    ) -> PlanSolution:
+        """Return the solution along the plan that the search from ``warm_start`` ends with.
+
+        Arguments are as in `torch_qpmpc.qp.solve.solve`; a plan is ``(*batch, N, n_u)``, flat or
+        not, or that of a `PlanSolution`. With NaN, or what is no plan, the search starts cold.
+        """
+        if not is_eager(theta := (*qp.tensors(), fixed)):
+            want = "a call outside torch.compile and torch.func, as a search depends on values"
+            raise QPError.expected("dynamics", "a traced call", want)
+        N, n_u = self.layout.horizon, self.layout.n_u
+        batch = torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
+        flat = [
+            x if x.ndim == n else x.expand(*batch, *x.shape[x.ndim - n :]).flatten(0, -n - 1)
+            for x, n in zip(qp.tensors(), NDIMS, strict=True)
+        ]
+        flat = QuadraticProgram(*flat, check_values=False)
+        fixed = fixed.expand(*batch, -1).reshape(batch.numel(), fixed.shape[-1])
+        plan = warm_start.plan if isinstance(warm_start, PlanSolution) else warm_start
+        if not isinstance(plan, Tensor) or not plan.is_floating_point():
+            plan = fixed.new_full((len(fixed), N, n_u), torch.nan)
+        elif plan.numel() != len(fixed) * N * n_u:
+            want = f"a plan ({N}, {n_u}) for each of {len(fixed)} states"
+            raise QPError.expected("warm_start", f"shape {tuple(plan.shape)}", want)
+        with torch.no_grad():
+            plan, own = plan.to(fixed).reshape(len(fixed), N, n_u), _taken(flat)
+            u, known, converged = self._search(own, fixed.detach(), plan, n_kept, solver)
+            w, x = known[1][:, self.entries], self.layout.predicted(known[1])[0][:, 1:]
+            defect = (self.outputs(w)[..., :-1] - x).abs().amax((1, 2))
+        if on_failure != "mask" and known[5].any():
+            report(known[5].cpu().numpy(), batch, on_failure)
+        strict = None
+        if torch.is_grad_enabled() and any(x.requires_grad for x in (*theta, *self.parameters())):
+            own = self.along(flat, known[1], known[2])
+            strict = _strict(own, fixed, known)
+            value, *rest = Known.apply(*own.tensors(), fixed, None, n_kept, solver, known)
+            no = ~strict.unsqueeze(-1)
+            known = (value, *(torch.where(no, x.detach(), x) for x in rest[:4]), *rest[4:])
+        parts = (*known, u, converged, defect, strict)
+        parts = (x if x is None else x.reshape((*batch, *x.shape[1:])) for x in parts)
+        return PlanSolution(qp, *parts)
+
+    def _search(
+        self, qp: QuadraticProgram, fixed: Tensor, plan: Tensor, n_kept: int, solver: str
+    ) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+        """Return the best plans found, the `PARTS` of their QPs' solutions, and the converged."""
+        layout, B = self.layout, len(fixed)
+        p, every = fixed[:, : layout.n_p], torch.arange(B)
+        n_p, n, N = layout.n_p, layout.n, layout.horizon
+        of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
+        hard = qp.w.isinf() & (qp.G[..., of_x] != 0).any(-1)  # no plan violates those of u alone
+        price = torch.where(qp.w.isinf(), 1.0, qp.w).expand(B, -1).clone()
+
+        def merit(index: Tensor, z: Tensor, costs: Tensor) -> Tensor:
+            """Return the cost of z ``(len(index), K, n_z)`` with the prices of violations."""
+            own = _taken(qp, index, 1)
+            y = times(own.G, z)
+            over = price[index].unsqueeze(1) * torch.maximum(own.lb - y, y - own.ub).relu()
+            costs = costs + over.sum(-1) + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
+            return costs.nan_to_num(torch.inf, torch.inf, torch.inf)
+
+        tries = torch.cat((plan.unsqueeze(1), self._plans(qp).expand(B, -1, -1, -1)), 1)
+        tries = torch.where(tries.isnan(), tries[:, 1:2], tries)
+        if fixed.shape[1] > n_p:
+            tries[:, :, 0] = fixed[:, None, n_p:]
+        tries = tries[:, :, self.held]
+        z, costs = self.simulated(p.unsqueeze(1), tries)
+        best = merit(every, z, costs).argmin(1)
+        u, z, costs = (x[every, best] for x in (tries, z, costs))
+        pull, parts = fixed.new_full((B,), FIRST), []
+        converged, done = torch.zeros(2, B, dtype=torch.bool)
+        for _ in range(self.iterations):
+            if not len(todo := (~done).nonzero().squeeze(1)):
+                break
+            near = self.along(_taken(qp, todo), z[todo])
+            size = near.H.diagonal(dim1=1, dim2=2)
+            size = pull[todo, None] * size.maximum(1e-3 * size.mean(1, keepdim=True)).clamp(1e-12)
+            near.H.diagonal(dim1=1, dim2=2).add_(size)
+            near.q.sub_(size * z[todo])
+            near.c.add_((size * z[todo] ** 2).sum(-1) / 2)
+            solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
+            own = [getattr(solution, name) for name in PARTS]
+            parts = parts or [x.new_empty(B, *x.shape[1:]) for x in own]
+            for part, x in zip(parts, own, strict=True):
+                part[todo] = x
+            solved, among = solution.solved, torch.arange(len(todo))
+            lam = torch.where(hard & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
+            price[todo] = price[todo].maximum(lam)
+            step = (layout.predicted(solution.z)[1] - u[todo]) * solved[:, None, None]
+            tries = torch.stack([u[todo] + share * step for share in FRACTIONS], 1)
+            found = self.simulated(p[todo].unsqueeze(1), tries)
+            before = merit(todo, z[todo].unsqueeze(1), costs[todo].unsqueeze(1))[:, 0]
+            after, best = merit(todo, *found).min(1)
+            better = solved & (after <= before + ROUNDING * (1 + before.abs()))
+            for own, new in zip((u, z, costs), (tries, *found), strict=True):
+                own[todo[better]] = new[among, best][better]
+            size = step.abs().amax((1, 2)) / (1 + u[todo].abs().amax((1, 2)))
+            converged[todo] = solved & (size <= SETTLED) & (pull[todo] <= 1)
+            pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
+            pull.clamp_(LEAST)
+            done[todo] = ~solved | converged[todo] | (pull[todo] > MOST)
+        left = (~converged & (parts[5] == 0)).nonzero().squeeze(1)  # the plan in place of the QP's
+        parts[0][left] = merit(left, z[left].unsqueeze(1), costs[left].unsqueeze(1))[:, 0]
+        parts[1][left] = z[left]
+        return u, tuple(parts), converged
+
+    def _plans(self, qp: QuadraticProgram) -> Tensor:
+        """Return plans ``(.., K, N, n_u)``, held at zero and random within the bounds."""
+        N, sides = self.layout.horizon, []
+        for side, none in ((qp.lb, -1.0), (qp.ub, 1.0)):
+            rows = side[..., : N * self.layout.n].unflatten(-1, (N, -1))[..., self.layout.n_x :]
+            sides.append(torch.where(rows.isfinite(), rows, none).unsqueeze(-3))
+        generator, low, high = torch.Generator().manual_seed(0), sides[0], sides[1]
+        share = torch.rand(RANDOM, -(-N // HOLD), self.layout.n_u, generator=generator)
+        share = share.repeat_interleave(HOLD, 1)[:, :N].to(low)
+        return torch.cat((torch.zeros_like(low).clamp(low, high), low + share * (high - low)), -3)
+
+
+def at_origin(dynamics: Callable[..., Any], layout: Layout) -> dict[str, Tensor]:
+    """Return A, B, E and the offset of the linearisation at the origin, by name."""
+    model = SequentialQP(dynamics, layout, 1.0)
+    w = torch.zeros(1, layout.n_d + layout.n, dtype=torch.float64)
+    out, J = _jacobian(model.outputs, w, layout.n_x + 1)
+    E, A, B = J[0, :-1].split(model.sizes, -1)
+    return {"A": A, "B": B, "E": E, "offset": out[0, :-1]}
+
+
+def _jacobian(
+    function: Callable[[Tensor], Tensor], w: Tensor, size: int, create_graph: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Return a function of w ``(.., n)`` with ``size`` outputs, and its Jacobian.
+
+    One pass of a copy of w for each output: the function may have any operations.
+    """
+    with torch.enable_grad():
+        copies = w.detach().expand(size, *w.shape).requires_grad_()
+        out = function(copies) + 0 * copies.sum(-1, keepdim=True)  # depends on w in any case
+        units = torch.eye(size).to(w).reshape(size, *(1,) * (w.ndim - 1), size).expand_as(out)
+        options = {"create_graph": create_graph, "materialize_grads": True}
+        (J,) = torch.autograd.grad(out, copies, units, **options)
+    return (out[0] if create_graph else out[0].detach()), J.movedim(0, -2)
+
+
+def _taken(qp: QuadraticProgram, index: Any = slice(None), more: int = 0) -> QuadraticProgram:
+    """Return the QPs at ``index``, detached, with ``more`` dimensions after the batch's."""
+    parts = [
+        x.detach() if x.ndim == n else x.detach()[index].unflatten(0, (-1, *(1,) * more))
+        for x, n in zip(qp.tensors(), NDIMS, strict=True)
+    ]
+    return QuadraticProgram(*parts, check_values=False)
+
+
+def _strict(qp: QuadraticProgram, fixed: Tensor, known: Sequence[Tensor]) -> Tensor:
+    """Return the mask of plans whose Hessian is positive definite where active rows leave them."""
+    theta, lam, n_f = [x.detach() for x in qp.tensors()], known[3], fixed.shape[-1]
+    programs, _ = Programs.of(*theta, fixed.detach(), n_kept=n_f)
+    condensed = programs.prepared.condensed(n_f)
+    H, G = (to_tensor(x[:, :, n_f:])[programs.group] for x in (condensed.H, condensed.G))
+    H, rows = H[:, n_f:], torch.where(active_rows(lam, *theta[6:])[0].unsqueeze(-1), G, 0)
+    free = torch.eye(H.shape[-1]).to(H) - torch.linalg.pinv(rows) @ rows
+    size = H.abs().amax((1, 2), keepdim=True)
+    values = torch.linalg.eigvalsh(free @ H @ free + size * (torch.eye(H.shape[-1]).to(H) - free))
+    return values[:, 0] > DEFINITE * size[:, 0, 0]
