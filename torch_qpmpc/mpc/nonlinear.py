@@ -244,8 +244,8 @@ class SequentialQP(nn.Module):
         if not is_eager(theta := (*qp.tensors(), fixed)):
             want = "a call outside torch.compile and torch.func, as a search depends on values"
             raise QPError.expected("dynamics", "a traced call", want)
-        N, n_u = self.layout.horizon, self.layout.n_u
-        batch = torch.broadcast_shapes(qp.batch_shape, fixed.shape[:-1])
+        N, n_u, batch = self.layout.horizon, self.layout.n_u, fixed.shape[:-1]
+        batch = torch.broadcast_shapes(qp.batch_shape, batch)
         flat = [
             x if x.ndim == n else x.expand(*batch, *x.shape[x.ndim - n :]).flatten(0, -n - 1)
             for x, n in zip(qp.tensors(), NDIMS, strict=True)
@@ -280,9 +280,8 @@ class SequentialQP(nn.Module):
         self, qp: QuadraticProgram, fixed: Tensor, plan: Tensor, n_kept: int, solver: str
     ) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
         """Return the best plans found, the `PARTS` of their QPs' solutions, and the converged."""
-        layout, B = self.layout, len(fixed)
-        p, every = fixed[:, : layout.n_p], torch.arange(B)
-        n_p, n, N = layout.n_p, layout.n, layout.horizon
+        layout, B, every = self.layout, len(fixed), torch.arange(len(fixed))
+        n_p, n, N, p = layout.n_p, layout.n, layout.horizon, fixed[:, : layout.n_p]
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
         hard = qp.w.isinf() & (qp.G[..., of_x] != 0).any(-1)  # no plan violates those of u alone
         price = torch.where(qp.w.isinf(), 1.0, qp.w).expand(B, -1).clone()
