@@ -31,7 +31,7 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 BUDGET = {
     ".": 413,
     "analysis": 851,
-    "control": 4746,
+    "control": 4745,
     "envs": 1440,
     "experiment": 2985,
     "export": 1515,

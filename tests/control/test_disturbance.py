@@ -7,6 +7,7 @@ import pytest
 
 from torch_qpmpc import QPError
 from torch_qpmpc.control.disturbance import Steady, choose
+from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import read_model
 
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.5]], [[0.0], [1.0]], [[1.0, 0.0]])
@@ -61,5 +62,6 @@ def test_disturbances_that_cannot_be_estimated_are_named(model, wanted, message)
 
 def test_a_mode_at_one_without_an_input_has_no_steady_state():
     plant = read_model(([[1.0, 0.0], [0.0, 0.5]], [[0.0], [1.0]]))
+    weights = choose(plant, None), np.eye(2), np.eye(1), np.zeros(1)
     with pytest.raises(QPError, match="a mode at 1 that no input moves, expected a model"):
-        Steady.of(plant, choose(plant, None), np.eye(2), np.eye(1))
+        Steady.of(plant, *weights, Scaling.of(plant))

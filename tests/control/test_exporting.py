@@ -39,7 +39,7 @@ MPCS = {
     "preview": lambda: learned("preview"),
     "blocks": lambda: learned(blocks=[1, 3]),
     "more outputs": lambda: qm.LinearMPC((A, B[:, :1], C), 8, Q=[1.0, 0.5], **SIZES),
-    "more inputs": lambda: qm.LinearMPC((A, B, C), 8, Q=[1.0, 0.0], **SIZES),
+    "more inputs": lambda: qm.LinearMPC((A, B, C), 8, Q=[1.0, 0.0], **SIZES, u_target=[0.3, -0.2]),
     "unbounded": lambda: qm.LinearMPC((A, B, C), 5, Q=1.0, R=0.1, disturbances=None),
 }
 

@@ -23,6 +23,7 @@ DESIGN: dict[str, Any] = {
     "u_bounds": {"p": (-1.0, 1.0), "q": (-1.0, "cap")},
     "du_bounds": {"p": (-0.5, 0.5), "q": (-0.4, 0.6)},
     "y_slack": {"a": 50.0, "b": 70.0},
+    "u_target": {"p": 0.1, "q": 0.2},
 }
 FILTER: dict[str, Any] = {
     "noise": {"a": 0.01, "b": 0.02},
@@ -37,6 +38,7 @@ CHANGES: dict[str, Any] = {
     "u_bounds": (-0.5, "cap"),
     "du_bounds": (-0.1, 0.1),
     "y_slack": 90.0,
+    "u_target": 0.3,
     "noise": 0.05,
     "drift": 0.5,
 }

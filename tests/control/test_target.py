@@ -18,12 +18,12 @@ def drawn(seed: int) -> qm.LinearMPC:
     A = basis * rng.uniform(-0.5, 0.9, n) @ basis.T
     B, C = rng.normal(size=(n, 4)), rng.normal(size=(n_y, n))
     bounds = -rng.uniform(0.2, 1, 4), rng.uniform(0.2, 1, 4)
-    R = rng.uniform(0.1, 2, 4)
-    return qm.LinearMPC((A, B, C), 2, Q=rng.uniform(0.5, 2, n_y), R=R, u_bounds=bounds)
+    R, Q, aim = rng.uniform(0.1, 2, 4), rng.uniform(0.5, 2, n_y), rng.uniform(-0.3, 0.3, 4)
+    return qm.LinearMPC((A, B, C), 2, Q=Q, R=R, u_bounds=bounds, u_target=aim)
 
 
 def nearest(mpc: qm.LinearMPC, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the steady outputs nearest to r, and the least inputs of those that have them."""
+    """Return the steady outputs nearest to r, and of the inputs with them those near u_target."""
     plant, (lower, upper) = mpc.design.plant, mpc.design.u_bounds
     gain = plant.C @ np.linalg.solve(np.eye(len(plant.A)) - plant.A, plant.B)
     Q = gain.T @ mpc.design.Q @ gain
@@ -34,13 +34,14 @@ def nearest(mpc: qm.LinearMPC, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # Of all u with these outputs: u = u_0 + F f.
     F, R = scipy.linalg.null_space(gain), mpc.design.R
     rows = {"G": np.vstack((F, -F)), "h": np.append(upper - u, u - lower) + 1e-9}
-    f = qpsolvers.solve_qp(F.T @ R @ F, F.T @ R @ u, **rows, solver="quadprog")
+    off = F.T @ R @ (u - mpc.design.resting)
+    f = qpsolvers.solve_qp(F.T @ R @ F, off, **rows, solver="quadprog")
     assert f is not None
     return y, u + F @ f
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_inputs_that_the_set_point_leaves_free_are_least(seed):
+def test_inputs_that_the_set_point_leaves_free_are_near_their_target(seed):
     mpc, rng = drawn(seed), np.random.default_rng([seed, 1])
     assert mpc.free is not None
     for size in (0.3, 1.0, 4.0):
@@ -48,6 +49,28 @@ def test_inputs_that_the_set_point_leaves_free_are_least(seed):
         target, (y, u) = mpc.target(r), nearest(mpc, r)
         assert np.abs(target.y.numpy() - y).max() < 1e-8
         assert np.abs(target.u.numpy() - u).max() < 1e-5
+
+
+def test_free_inputs_rest_near_the_log_s_mean_unless_told():
+    rng, T = np.random.default_rng(0), np.full(400, 20.0)
+    q = rng.uniform(2, 6, (20, 2)).repeat(20, 0)
+    for k in range(399):
+        T[k + 1] = 0.8 * T[k] + 0.5 * q[k, 0] + 0.5 * q[k, 1] + 0.01 * rng.normal()
+    log = qm.read_log({"T": T, "q1": q[:, 0], "q2": q[:, 1]}, outputs=["T"], inputs=["q1", "q2"])
+    mpc = qm.LinearMPC(qm.identify(log, horizon=8), 8, Q=1.0, R=0.1, dR=0.1, u_target={"q2": 1.0})
+    controller = qm.Controller(mpc)
+    mean = q[:-1, 0].mean()
+    assert np.allclose(mpc.design.resting, [mean, 1.0], rtol=1e-6)
+    middle = mpc.target([20.0]).u.sum()
+    assert np.allclose(middle, 8.0, atol=0.1)
+    assert np.allclose(np.diff(mpc.target([20.0]).u), 1.0 - mean, atol=0.1)
+    controller.step([20.0], [20.0])
+    assert f"free: at rest near {mean:.4g}" in str(controller.explain())
+    assert controller.review()["free inputs"].text.endswith(f"near q1 {mean:.4g} and q2 1.")
+    controller.redesign(u_target={"q2": None, "q1": 3.0})
+    assert np.allclose(controller.mpc.design.resting, [3.0, q[:-1, 1].mean()], rtol=1e-6)
+    with pytest.raises(qm.QPError, match=r"^u_target: got \[inf, 1.0\], expected finite numbers"):
+        controller.redesign(u_target=[np.inf, 1.0])
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -221,9 +221,9 @@ class Controller:
 
         Args:
             changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
-                ``du_bounds`` and ``y_slack`` of `LinearMPC`, and ``noise`` and ``drift``. A mapping
-                changes the signals that it names; None in it removes a bound or a weight, or asks
-                for the default of a price or a deviation.
+                ``du_bounds``, ``y_slack`` and ``u_target`` of `LinearMPC`, and ``noise`` and
+                ``drift``. A mapping changes the signals that it names; None in it removes a bound
+                or a weight, or asks for the default of another argument.
 
         Raises:
             QPError: an argument is invalid, or the MPC learns.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
-from torch_qpmpc.control.disturbance import PREFIX, Disturbances, Steady
+from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
 from torch_qpmpc.control.scaling import Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
@@ -45,6 +45,7 @@ class Design:
             ``integer_horizon`` and ``max_nodes``.
         limits: known signals that bound an output or input from below and above, by its name, ""
             on a side without one.
+        u_target: what inputs rest near, by name; see `resting`.
 
     Raises:
         QPError: a number is invalid, or nothing has a cost.
@@ -67,6 +68,7 @@ class Design:
     limits: dict[str, tuple[str, str]] = field(default_factory=dict)
     levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
     switching: dict[str, Any] = field(default_factory=dict)
+    u_target: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choice("references", self.references, REFERENCES)
@@ -79,6 +81,8 @@ class Design:
         object.__setattr__(self, "u_bounds", within_levels(self.u_bounds, self.levels, self.plant))
         prices = np.where(np.isnan(self.y_slack), self.price, self.y_slack)
         object.__setattr__(self, "y_slack", prices)
+        if not np.isfinite(self.resting).all():
+            raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
         if (self.y_slack < 0).any():
             got = f"{self.y_slack.tolist()}"
             raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
@@ -101,6 +105,8 @@ class Design:
         if unknown := sorted({*changes} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         old = getattr(self, name)
+        if name == "u_target":
+            return {**old, **changes}
         if name == "y_slack":
             return {**dict(zip(names, old.tolist(), strict=True)), **changes}
         if name.endswith("_bounds"):
@@ -178,6 +184,7 @@ class Design:
             self,
             plant=self.scaling.plant(self.plant),
             levels={},
+            u_target={},
             Q=self.Q * np.outer(y, y),
             R=self.R * np.outer(u, u),
             dR=self.dR * np.outer(u, u),
@@ -196,7 +203,20 @@ class Design:
     @cached_property
     def steady(self) -> Steady:
         """The steady states with the disturbances."""
-        return Steady.of(self.plant, self.disturbances, self.Q, self.R, self.scaling)
+        weights = self.Q, self.R
+        return Steady.of(self.plant, self.disturbances, *weights, self.resting, self.scaling)
+
+    @property
+    def resting(self) -> Array:
+        """What inputs that r leaves free rest near, ``(m,)``: u_target, the log's mean, or zero."""
+        known = {**self.plant.means, **self.u_target}
+        return np.array([known.get(name, 0.0) for name in self.plant.inputs])
+
+    @property
+    def free(self) -> Array:
+        """Mask of the inputs that set-points leave free, ``(m,)``."""
+        moved = np.abs(self.steady.U[:, self.steady.n_a :]).max(-1, initial=0.0)
+        return moved > TIE * self.scaling.u
 
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
@@ -486,13 +506,13 @@ def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:
     return weight
 
 
-def read_slack(value: Any, names: Sequence[str]) -> Array:
-    """Read prices of violations, NaN where None or no entry of a mapping asks for the default."""
+def read_wished(name: str, value: Any, names: Sequence[str]) -> Array:
+    """Read a number for each name, NaN where None or no entry of a mapping asks for the default."""
     if value is None or isinstance(value, Mapping):
         value = {key: x for key, x in (value or {}).items() if x is not None}
-    prices = read_vector("y_slack", value, names, 0.0)
-    by_default = isinstance(value, Mapping) and [name not in value for name in names]
-    return np.where(by_default, np.nan, prices)
+    numbers = read_vector(name, value, names, 0.0)
+    by_default = isinstance(value, Mapping) and [key not in value for key in names]
+    return np.where(by_default, np.nan, numbers)
 
 
 def read_moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:

@@ -11,9 +11,9 @@ The steady states (x_s, u_s) for w and known signals d are the affine set
 
     [x_s; u_s] = Z v + M [w; d; 1],   Z a basis of the null space of [A - I, B].
 
-The target is the nearest to the set-point, and the one with the least u_s'R u_s of several. Where
-several have the same outputs with a weight, v = [a; f]: a determines these outputs, and f is the
-distance from the one with the least u_s'R u_s.
+The target is the nearest to the set-point, and of several the one with the least
+(u_s - u_0)'R(u_s - u_0), where u_0 is what free inputs rest near. Where several have the same
+outputs with a weight, v = [a; f]: a determines these, and f is the distance from the least one.
 """
 
 from __future__ import annotations
@@ -213,17 +213,16 @@ class Steady:
 
     @classmethod
     def of(
-        cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array, scaling: Scaling | None = None
+        cls, plant: StateSpace, w: Disturbances, Q: Array, R: Array, u_0: Array, sizes: Scaling
     ) -> Steady:
         """Return the steady states of ``plant`` with disturbances ``w`` and the weights Q and R.
 
-        The sizes of the plant's signals are those of ``scaling``.
+        Free inputs rest near u_0 ``(m,)``, and ``sizes`` are those of the plant's signals.
 
         Raises:
             QPError: no input moves a mode at one.
         """
         n, m, _, n_d = plant.sizes
-        sizes = scaling or Scaling.of(plant, Q=Q)
         normal = sizes.plant(plant)
         balance = np.hstack((normal.A - np.eye(n), normal.B))
         if null_direction(normal.A.T - np.eye(n), normal.B.T) is not None:
@@ -244,8 +243,9 @@ class Steady:
             least = REGULARISATION * max(costs[-1], RANK * np.linalg.norm(R, 2))
             W = V_f * np.maximum(costs, least) @ V_f.T
             least = -np.linalg.solve(W, F.T @ U.T @ R)  # f of the least u'R u, for u without it
-            T = np.hstack((V + F @ least @ U @ V, F))
-            x, y, u = (of + basis @ F @ least @ u for of, basis in ((x, X), (y, Y), (u, U)))
+            T, off = np.hstack((V + F @ least @ U @ V, F)), u.copy()
+            off[:, -1] -= u_0 / sizes.u
+            x, y, u = (of + basis @ F @ least @ off for of, basis in ((x, X), (y, Y), (u, U)))
             X, U, Y = X @ T, U @ T, Y @ T
             Y[:, -len(W) :][np.abs(Y[:, -len(W) :]) < RANK] = 0.0
         X, x, U, u, Y, y = (

@@ -61,9 +61,11 @@ class Explanation:
             later *= bool(np.isfinite(self.y[-1, i]))
             lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
         for i, name in enumerate(plant.inputs):
+            rests = f", free: at rest near {self.design.resting[i]:.4g}" * bool(self.design.free[i])
             shown = np.unique(np.linspace(0, len(self.u) - 1, 6).astype(int))[1:]
             later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
-            lines.append(f"{plant.quantity(name, self.u[0, i])}{', then ' * bool(later)}{later}")
+            later = f"{', then ' * bool(later)}{later}"
+            lines.append(f"{plant.quantity(name, self.u[0, i])}{later}{rests}")
             on = self.u[:, i] > np.mean(self.design.levels.get(name, (0.0,))[:2])
             if name in self.design.levels and (on != on[0]).any():
                 lines.append(

@@ -12,13 +12,14 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import ROUNDS, STAYS
 from torch_qpmpc.control.observer import STEADY
-from torch_qpmpc.control.simulation import at_rest, centre, closed_loop, last_known
+from torch_qpmpc.control.simulation import centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, check_name, export_c
@@ -90,14 +91,7 @@ class Loop(NamedTuple):
 
 
 class CompiledController:
-    """The functions of an exported controller, compiled.
-
-    Args:
-        files: the texts of the C files by name.
-        name: the beginning of the names in C.
-        dtype: of all numbers.
-        n_u: the number of inputs.
-    """
+    """The functions of an exported controller of n_u inputs, compiled from texts by file name."""
 
     def __init__(self, files: Mapping[str, str], name: str, dtype: str, n_u: int) -> None:
         size = SIZE.replace("policy", name)
@@ -241,14 +235,14 @@ def _course(law: Law, known: Array) -> dict[str, Any]:
     rows = COMPARED + design.horizon + 1
     size_y, size_u = design.usual, design.scaling.u
     moves = rng.uniform(-1, 1, (-(-rows // 25), len(size_y))).repeat(25, 0)[:rows]
-    x, u = at_rest(law.mpc, known)
+    r = centre(design, known)
+    x, u, *_ = map(torch.Tensor.numpy, law.mpc.target(r, known=known))  # as near as bounds allow
     moved = 0.1 * design.scaling.d * rng.normal(size=(rows, len(known)))
     for of in design.limited:  # bounds are wider than at rest, so that there is a plan
         for places, sign in zip(of, (-1, 1), strict=True):
             moved[:, places[places >= 0]] = sign * np.abs(moved[:, places[places >= 0]])
-    r = centre(design, known) + moves * size_y
     disturbed = {"load": 0.05 * size_u, "noise": 0.01 * size_y}
-    return {"r": r, "u": u, "x": x, "known": known + moved, **disturbed}
+    return {"r": r + moves * size_y, "u": u, "x": x, "known": known + moved, **disturbed}
 
 
 def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, largest
+from torch_qpmpc.control.design import Design, largest, read_wished
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.lowering import ROUNDS, stays
 from torch_qpmpc.control.observer import (
@@ -24,7 +24,7 @@ from torch_qpmpc.control.observer import (
     max_plausible,
     moving,
 )
-from torch_qpmpc.control.state_space import Array, read_table, read_vector
+from torch_qpmpc.control.state_space import Array, read_table
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import Searches
 from torch_qpmpc.qp.pipeline.solve import AtRest
@@ -174,12 +174,11 @@ class Law:
     def redesigned(self, **changes: Any) -> Law:
         """Return the law with other settings; see `Controller.redesign`."""
         names = {"noise": self.design.plant.outputs, "drift": self.design.disturbances.names}
-        wished = {name: changes.pop(name) for name in names if name in changes}
-        mpc = self.mpc.redesigned(**changes)
-        if not wished:
+        mpc = self.mpc.redesigned(**{x: changes[x] for x in changes if x not in names})
+        if not names.keys() & changes:
             return replace(self, mpc=mpc)
-        settings = {name: getattr(self, name) for name in names} | wished
-        for name, value in wished.items():
+        settings = {x: changes.get(x, {}) for x in names}
+        for name, value in settings.items():
             if isinstance(value, Mapping):
                 old = zip(names[name], getattr(self, name).tolist(), strict=True)
                 settings[name] = {**dict(old), **value}
@@ -437,12 +436,8 @@ class Law:
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
     """Read standard deviations, which must be positive; None asks for the default."""
-    if value is None:
-        return default
-    if isinstance(value, Mapping):
-        named = {key: x for key, x in value.items() if x is not None}
-        value = dict(zip(names, default.tolist(), strict=True)) | named
-    vector = read_vector(name, value, names, 0.0)
+    wished = read_wished(name, value, names)
+    vector = np.where(np.isnan(wished), default, wished)
     if not ((vector > 0) & np.isfinite(vector)).all():
         got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))
         raise QPError.expected(name, got, "a standard deviation > 0 of each")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_lyapunov
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
@@ -101,20 +101,13 @@ class LinearLoop:
         for the margin a (Skogestad and Postlethwaite, "Multivariable feedback control", 2005).
         """
         A_c, B_c, C_c, D_c = self.controller
-        A, B, C = self.plant
-        states, inputs, outputs = (
-            np.asarray(block_diag(*pair)) for pair in ((A, A_c), (B, B_c), (C, C_c))
+        z = np.exp(1j * np.geomspace(SLOWEST, np.pi, FREQUENCIES))[:, None, None]
+        P, K = (
+            C @ np.linalg.solve(z * np.eye(len(A)) - A, B)
+            for A, B, C in (self.plant, (A_c, B_c, C_c))
         )
-        least = np.inf
-        for omega in np.geomspace(SLOWEST, np.pi, FREQUENCIES):
-            z = np.exp(1j * omega) * np.eye(len(states))
-            response = outputs @ np.linalg.solve(z - states, inputs)
-            P = response[: len(C), : B.shape[1]]
-            K = response[len(C) :, B.shape[1] :] + D_c
-            loop = K @ P * (self.units / self.units[:, None])
-            sizes = np.linalg.svd(np.eye(len(K)) - loop, compute_uv=False)
-            least = min(least, float(sizes[-1]))
-        return least
+        loop = (K + D_c) @ P * (self.units / self.units[:, None])
+        return float(np.linalg.svd(np.eye(len(D_c)) - loop, compute_uv=False)[:, -1].min())
 
 
 def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:

@@ -19,9 +19,9 @@ from torch_qpmpc.control.design import (
     read_limits,
     read_moves,
     read_prices,
-    read_slack,
     read_switching,
     read_weight,
+    read_wished,
     signals_of,
     within_levels,
 )
@@ -91,6 +91,8 @@ class LinearMPC:
         blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
             ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves then hold between blocks.
         gamma: the discount.
+        u_target: inputs that the set-points leave free rest near these, weighted by R; by name, a
+            number or a vector. By default the means of the model's log, and zero without one.
         u_levels: the levels of inputs that take no other values, ``{"q": (0.0, 4.0, 8.0)}``; the
             lowest is *off*.
         min_on, min_off: the fewest steps that such an input stays on, at any level but the lowest,
@@ -134,6 +136,7 @@ class LinearMPC:
         u_bounds: Any = None,
         du_bounds: Any = None,
         y_slack: Any = None,
+        u_target: Any = None,
         linear: Mapping[str, str | float] | None = None,
         references: str = "held",
         disturbances: Any = "auto",
@@ -157,7 +160,7 @@ class LinearMPC:
         prices += [*signals_of(y_bounds), *signals_of(u_bounds)]
         plant = read_model(model, E, dt, inputs, outputs, known, prices)
         check_whole("horizon", horizon, 1)
-        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
+        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack, "u_target": u_target}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         wishes = read_wishes(plant, None, **weights, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
@@ -277,7 +280,10 @@ class LinearMPC:
     def of_stored(cls, content: Mapping[str, Any]) -> LinearMPC:
         """Return the LinearMPC of the ``content`` of a file."""
         options = {name: content["arguments"][name] for name in KEYWORDS}
-        mpc = cls.of_design(read_stored(content["design"]), **options)
+        parts = unpacked(content["design"])
+        parts["plant"] = StateSpace(**parts["plant"])
+        parts["disturbances"] = Disturbances(**parts["disturbances"])
+        mpc = cls.of_design(Design(**parts), **options)
         if mpc.plan.learned:  # else theta is the design's
             mpc.plan.load_state_dict(content["mpc"])
         return mpc
@@ -377,10 +383,13 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
         "Q": lambda name, value: read_weight(name, value, y),
         "R": lambda name, value: read_weight(name, value, u),
         "dR": lambda name, value: read_weight(name, value, u),
-        "y_slack": lambda _, value: read_slack(value, y),
+        "y_slack": lambda name, value: read_wished(name, value, y),
         "y_bounds": lambda name, value: read_bounds(name, value, y),
         "u_bounds": lambda name, value: read_bounds(name, value, u),
         "du_bounds": lambda _, value: read_moves(value, u),
+        "u_target": lambda name, value: {
+            key: x for key, x in zip(u, read_wished(name, value, u).tolist(), strict=True) if x == x
+        },
     }
     check_keywords("redesign", wishes, [*readers])
     limits = {} if old is None else old.limits
@@ -399,14 +408,6 @@ def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:
     if content["version"] < VERSION and content["arguments"]["learn"]:
         got, want = f"{path}, whose plan has learned another cost", f"a file of version {VERSION}"
         raise QPError.expected("path", got, want, "Learn again: its design and log go on.")
-
-
-def read_stored(content: Mapping[str, Any]) -> Design:
-    """Return the design that ``content`` was `packed` of."""
-    parts = unpacked(content)
-    parts["plant"] = StateSpace(**parts["plant"])
-    parts["disturbances"] = Disturbances(**parts["disturbances"])
-    return Design(**parts)
 
 
 def packed(value: Any) -> Any:

@@ -86,6 +86,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     findings = [
         cost,
         _terminal(design),
+        *([_free_inputs(design)] if design.free.any() else []),
         _horizon(design),
         _disturbances(design),
         _hard_rows(mpc, r_last, known),
@@ -145,6 +146,13 @@ def _terminal(design: Design) -> Finding:
         remedy = "Remove the mode from the model, or pass it as a known signal."
     text = text if exists else f"The cost after the horizon is that of its end alone, as {why}."
     return Finding("terminal weight", exists, text, remedy * (not exists))
+
+
+def _free_inputs(design: Design) -> Finding:
+    """What inputs rest near that the set-points leave free."""
+    pairs = zip(design.plant.inputs, design.resting, design.free, strict=True)
+    rests = " and ".join(design.plant.quantity(name, x) for name, x, free in pairs if free)
+    return Finding("free inputs", True, f"Set-points leave inputs free, which rest near {rests}.")
 
 
 def _horizon(design: Design) -> Finding:

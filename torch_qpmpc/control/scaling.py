@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from torch_qpmpc.control.state_space import Array, StateSpace
+from torch_qpmpc.export.tables import FAR
 
 #: The fewest steps of the responses that sizes follow from.
 STEPS = 20
 #: Weight of outputs beside an input that is at rest with them: it decides for integrators.
 FAINT = 1e-6
-#: A bound this many times further away than a signal's other sizes does not act.
-FAR = 1e6
 Bounds = tuple[Array, Array]
 
 

@@ -12,7 +12,6 @@ import torch
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals
-from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.scaling import FAINT, Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
 from torch_qpmpc.errors import QPError, SolverError
@@ -131,7 +130,11 @@ def closed_loop(
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        plant = _Model(model, design, d, u, memory.rest[0], near, x)
+        d = _known(model, design, d)
+        scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
+        rest = scaling.at_rest(model, u, d[0], memory.rest[0], near)
+        states = [f"x{i + 1}" for i in range(len(model.A))]
+        plant = _Model(model, d, rest if x is None else read_vector("x", x, states, 0.0))
     rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
     if not (isinstance(started, tuple) and len(started) == 2):
         remedy = "Its reset returns the outputs and a dict."
@@ -167,46 +170,36 @@ def closed_loop(
         yield signals, move, y
 
 
+def _known(model: StateSpace, design: Design, d: Array) -> Array:
+    """Return the rows of known signals that a model of a design's signals takes."""
+    got, want = model.sizes[1:3], design.plant.sizes[1:3]
+    if got != want:
+        got, want = (f"{m} inputs and {n_y} outputs" for m, n_y in (got, want))
+        raise QPError.expected("plant", got, f"the controller's {want}")
+    if len(model.known) not in (0, d.shape[1]):
+        got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
+        raise QPError.expected("plant", got, want)
+    return d[:, : len(model.known)]
+
+
+@dataclass
 class _Model:
-    """A model with Gymnasium's ``reset`` and ``step``, which starts at rest with the input u.
+    """A model with Gymnasium's ``reset`` and ``step``, which starts at x with known signals d."""
 
-    With outputs y it starts as near to them, with a weight, as `Scaling.at_rest` says.
-    """
-
-    def __init__(
-        self,
-        model: StateSpace,
-        design: Design,
-        d: Array,
-        u: Array,
-        y: Array | None,
-        weight: float,
-        x: Any,
-    ) -> None:
-        got, want = model.sizes[1:3], design.plant.sizes[1:3]
-        if got != want:
-            got, want = (f"{m} inputs and {n_y} outputs" for m, n_y in (got, want))
-            raise QPError.expected("plant", got, f"the controller's {want}")
-        self._model, self._d = model, d if model.known else d[:, :0]
-        if self._d.shape[1] != len(model.known):
-            got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
-            raise QPError.expected("plant", got, want)
-        scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
-        rest = scaling.at_rest(model, u, self._d[0], y, weight)
-        states = [f"x{i + 1}" for i in range(len(model.A))]
-        self._start = rest if x is None else read_vector("x", x, states, 0.0)
+    model: StateSpace
+    d: Array
+    x: Array
+    k: int = 0
 
     def reset(self, *, seed: int) -> tuple[Array, dict]:
         del seed
-        self._x, self._k = self._start, 0
-        return self._model.C @ self._x, {}
+        return self.model.C @ self.x, {}
 
     def step(self, u: Array) -> tuple[Array, dict]:
-        model = self._model
-        driven = model.B @ u + model.E @ self._d[self._k] + model.offset
-        self._x = model.A @ self._x + driven
-        self._k += 1
-        return self._model.C @ self._x, {}
+        model = self.model
+        self.x = model.A @ self.x + model.B @ u + model.E @ self.d[self.k] + model.offset
+        self.k += 1
+        return model.C @ self.x, {}
 
 
 def ready(law: Law) -> Law:
@@ -236,9 +229,3 @@ def centre(design: Design, known: Array) -> Array:
     u, y = np.clip(0.0, lower + half, upper - half), design.middle
     held = design.plant.C @ design.scaling.at_rest(design.plant, u, known, y, FAINT)
     return np.where(design.ranged, y, np.clip(held, *design.y_bounds))
-
-
-def at_rest(mpc: LinearMPC, known: Array) -> tuple[Array, Array]:
-    """Return x and u of the model at rest as near to `centre` as its bounds allow."""
-    rest = mpc.target(centre(mpc.design, known), known=known)
-    return rest.x.numpy(), rest.u.numpy()
