@@ -69,11 +69,37 @@ def test_explain_names_the_next_switch():
     controller.step([0.0], r=[2.2])
     explanation = controller.explain()
     assert set(explanation.u[:5, 0].round(9)) <= {*LEVELS}
-    on = explanation.u[:, 0] > 2
-    assert f"q goes {'off' if on[0] else 'on'} in {(on != on[0]).argmax()} steps" in str(
-        explanation
-    )
+    u = explanation.u[:5, 0].round(9)
+    k = np.flatnonzero(u != u[0])[0]
+    assert f"q goes {'off' if u[k] == 0 else f'to {u[k]:.4g}'} in {k} step" in str(explanation)
+    assert "e-1" not in str(explanation)
     assert not [limit for limit in explanation.limits if limit.signal == "q"]
+
+
+def test_the_review_says_what_levels_hold_and_their_price():
+    finding = qm.Controller(of()).review(r=[2.2])["levels"]
+    assert finding.ok
+    assert "T 1.948 to 2.791, mean 2.343; q 0 to 4, mean 2.167" in finding.text
+    assert "without levels" in finding.text
+    band = {"min_on": {"q": 12}, "y_bounds": {"T": (1.8, 2.6)}}
+    finding = qm.Controller(of(**band)).review(r=[2.2])["levels"]
+    assert not finding.ok
+    assert "add a level, or widen y_bounds of T" in finding.remedy
+    hard = qm.Controller(of(**band, y_slack={"T": np.inf})).review(r=[2.2])["levels"]
+    assert "has no plan" in hard.text
+
+
+def test_a_redesign_that_contradicts_a_minimum_time_is_refused_and_changes_nothing():
+    controller = qm.Controller(of())
+    controller.reset(y=[0.0], u=[0.0])
+    controller.observe([0.0], [8.0])
+    match = r"u_bounds: got levels 0 of q, expected one that is on for 2 more steps, by min_on"
+    with pytest.raises(qm.QPError, match=match):
+        controller.redesign(u_bounds={"q": (0.0, 3.0)})
+    assert controller.step([0.0], r=[9.0])[0] == 8.0
+    controller.step([0.0], r=[9.0])
+    controller.redesign(u_bounds={"q": (0.0, 3.0)})
+    assert controller.step([0.0], r=[9.0])[0] == 0.0
 
 
 def test_a_file_goes_on_in_the_middle_of_a_minimum_time(tmp_path):
@@ -104,11 +130,12 @@ def test_without_a_plan_the_input_stays_on_a_level():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"u_levels": {"p": LEVELS}}, "u_levels: got 'p', expected a mapping from some of"),
+        ({"u_levels": {"p": LEVELS}}, "u_levels: got {'p': .*, expected a mapping from"),
         ({"u_levels": LEVELS}, "u_levels: got .* expected a mapping"),
-        ({"min_on": {"T": 2}}, "min_on: got 'T', expected a mapping from some of"),
+        ({"min_on": {"T": 2}}, "min_on: got 'T', expected names among q"),
         ({"u_bounds": {"q": (1.0, 2.0)}}, "u_bounds: got .1, 2. of q"),
         ({"u_levels": None}, "min_on: got {'q': 3}, expected u_levels"),
+        ({"du_bounds": {"q": (-4.0, 3.0)}}, "du_bounds: got .-4, 3. of q, expected moves of 4"),
         ({"blocks": [2, 6]}, "blocks: .* expected no blocks"),
     ],
 )

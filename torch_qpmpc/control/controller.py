@@ -186,7 +186,7 @@ class Controller:
         measured = read_measured("y", y, law.design.plant.outputs)
         self._now = Signals(measured, set_points, ahead)
         move = law.step(self._memory, *self._now)
-        self._memory, self.status = move.memory, move.status
+        self._memory, self.status, self._plan = move.memory, move.status, move.plan
         if move.target is not None and move.p is not None:
             self.target, self.p = move.target, move.p
         if isinstance(y, Mapping):
@@ -226,9 +226,11 @@ class Controller:
                 or a weight, or asks for the default of another argument.
 
         Raises:
-            QPError: an argument is invalid, or the MPC learns.
+            QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
         """
-        self._law = ready(self._law.redesigned(**changes))
+        law = self._law.redesigned(**changes)
+        law.check_runs(self._memory)
+        self._law = ready(law)
         u = np.clip(self.u, *self.mpc.design.u_bounds)
         self._memory, self._now = self._memory._replace(u=u), None
 
@@ -381,7 +383,7 @@ class Controller:
         if self._now is None:
             got, want = "no step since the last change", "a step to explain"
             raise QPError.expected("controller", got, want, "Call step first.")
-        return explain(self._law, self._memory, self.status, self._now, self.p)
+        return explain(self._law, self._memory, self.status, self._now, self._plan)
 
     def export_c(
         self, folder: str | Path, *, name: str = "policy", **options: Any

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
 from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
-from torch_qpmpc.control.scaling import Scaling, ranges
+from torch_qpmpc.control.scaling import Bounds, Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.levels import check_used, read_levels
+from torch_qpmpc.mpc.levels import DEFAULTS, check_used, read_levels
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 REFERENCES = ("held", "preview")
@@ -41,8 +41,7 @@ class Design:
         gamma: the discount.
         blocks: numbers of stages that share one input.
         levels: the levels of inputs that take only these, by name; ``u_bounds`` are within them.
-        switching: the arguments ``min_on``, ``min_off`` and ``start_cost`` by name, and
-            ``integer_horizon`` and ``max_nodes``.
+        switching: the other arguments of `Bounds` for them.
         limits: known signals that bound an output or input from below and above, by its name, ""
             on a side without one.
         u_target: what inputs rest near, by name; see `resting`.
@@ -78,7 +77,8 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-        object.__setattr__(self, "u_bounds", within_levels(self.u_bounds, self.levels, self.plant))
+        bounds = within_levels(self.u_bounds, self.levels, self.plant, self.du_bounds)
+        object.__setattr__(self, "u_bounds", bounds)
         prices = np.where(np.isnan(self.y_slack), self.price, self.y_slack)
         object.__setattr__(self, "y_slack", prices)
         if not np.isfinite(self.resting).all():
@@ -393,46 +393,47 @@ class Design:
         return {name: unit[place] for name, place in places.items()}
 
 
-def within_levels(
-    bounds: tuple[Array, Array], levels: Mapping[str, tuple[float, ...]], plant: StateSpace
-) -> tuple[Array, Array]:
+def within_levels(bounds: Bounds, levels: Any, plant: StateSpace, moves: Bounds) -> Bounds:
     """Return bounds of the inputs within their levels.
 
     Raises:
-        QPError: no level of an input is within its bounds.
+        QPError: no level of an input is within its bounds, or no move reaches the next one.
     """
-    if not levels:
-        return bounds
     lower, upper = (side.copy() for side in bounds)
     for name, own in levels.items():
         a = plant.inputs.index(name)
-        if not any(lower[a] <= x <= upper[a] for x in own):
+        kept = [x for x in own if lower[a] <= x <= upper[a]]
+        if not kept:
             got = f"[{lower[a]:g}, {upper[a]:g}] of {name}"
             want = f"bounds with one of its levels {', '.join(f'{x:g}' for x in own)}"
             raise QPError.expected("u_bounds", got, want)
+        gap, (down, up) = np.diff(kept).max(initial=0.0), (side[a] for side in moves)
+        if not down <= -gap <= gap <= up:
+            got = f"[{down:g}, {up:g}] of {name}"
+            raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
         lower[a], upper[a] = max(lower[a], own[0]), min(upper[a], own[-1])
     return lower, upper
 
 
 def read_switching(
-    u_levels: Any, plant: StateSpace, **others: Any
+    u_levels: Any, plant: StateSpace, rules: Mapping[str, Any], horizon: int | None, nodes: int
 ) -> tuple[dict[str, tuple[float, ...]], dict[str, Any]]:
-    """Read the levels of inputs, and minimum times and costs of starts, each by name.
+    """Read the levels of inputs by name, and the other arguments of `Bounds` for them.
 
     Raises:
         QPError: a name is no input with levels, or a level is no number.
     """
     if not u_levels:
-        check_used("u_levels", others)
-    for name, value in {"u_levels": u_levels, **others}.items():
-        mapping = isinstance(value, Mapping)
-        names = plant.inputs if name == "u_levels" else (u_levels or {})
-        wrong = sorted({*value} - {*names}) if mapping else []
-        if wrong or (name == "u_levels" and not (mapping or value is None)):
-            got, want = repr(wrong[0] if wrong else value), f"a mapping from some of {[*names]}"
-            raise QPError.expected(name, got, want)
-    levels = zip(u_levels or {}, read_levels((u_levels or {}).values()), strict=True)
-    return {name: own for name, own in levels if own}, others
+        check_used("u_levels", {**rules, "integer_horizon": horizon})
+        return {}, {}
+    if not isinstance(u_levels, Mapping) or {*u_levels} - {*plant.inputs}:
+        raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
+    levels = dict(zip(u_levels, read_levels(u_levels.values()), strict=True))
+    switching = {"integer_horizon": horizon, "max_nodes": nodes}
+    for name, value in rules.items():
+        own = dict(zip(levels, read_vector(name, value, [*levels], DEFAULTS[name]), strict=True))
+        switching[name] = tuple(float(own.get(x, DEFAULTS[name])) for x in plant.inputs)
+    return {name: own for name, own in levels.items() if own}, switching
 
 
 def largest(bounds: tuple[Array, Array] | Array) -> Array:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import PREFIX
@@ -16,6 +15,7 @@ from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
 from torch_qpmpc.control.review import Setting, set_points
 from torch_qpmpc.control.simulation import Run, last_known
 from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,11 +66,13 @@ class Explanation:
             later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
             later = f"{', then ' * bool(later)}{later}"
             lines.append(f"{plant.quantity(name, self.u[0, i])}{later}{rests}")
-            on = self.u[:, i] > np.mean(self.design.levels.get(name, (0.0,))[:2])
-            if name in self.design.levels and (on != on[0]).any():
-                lines.append(
-                    f"{name} goes {'off' if on[0] else 'on'} in {(on != on[0]).argmax()} steps"
-                )
+            levels = self.design.levels.get(name, ())
+            decided = self.u[: self.design.switching.get("integer_horizon"), i]
+            changed = np.flatnonzero(np.abs(np.diff(decided)) > ACTIVE * self.design.scaling.u[i])
+            if levels and len(changed):
+                k = changed[0] + 1
+                to = "off" if decided[k] < np.mean(levels[:2]) else f"to {decided[k]:.4g}"
+                lines.append(f"{name} goes {to} in {k} step{'s' * bool(k > 1)}")
         for name, x in self.disturbances.items():
             unit = plant.units.get(name.removeprefix(PREFIX), "")
             lines.append(f"{name} {x:.4g} {unit}".rstrip())
@@ -84,21 +86,23 @@ class Explanation:
         return Run(self.design, y, r, self.u, known[:-1], self.u, self.u[0]).plot()
 
 
-def explain(law: Law, memory: Memory, status: Outcome, now: Signals, p: Tensor) -> Explanation:
-    """Return what a step with the plan's input p has come to, from the memory after it."""
+def explain(
+    law: Law, memory: Memory, status: Outcome, now: Signals, plan: BatchSolution | None
+) -> Explanation:
+    """Return what a step with a plan has come to, from the memory after it."""
     design, mpc, known = law.design, law.mpc, now.known
     if status == Outcome.INVALID:  # the last valid signals hold
         known = np.tile(last_known(design, memory), (len(known), 1))
     u, e, rows = np.tile(memory.u, (design.horizon, 1)), memory.e, []
-    plan = law.plan(p.numpy(), memory) if status in PLANNED else None
     if plan is not None:
-        _, moved = mpc.plan.predicted(torch.from_numpy(plan[0]))
+        _, moved = mpc.plan.predicted(torch.from_numpy(plan.z[0]))
         u += (moved - moved[0]).numpy()
+        u[np.abs(u) < ACTIVE * design.scaling.u] = 0.0
     for k in range(len(u)):
         rows.append(np.full(len(design.Q), np.nan) if e is None else law.observer.H @ e)
         e = e if e is None else law.observer.predicted(e, u[min(k + 1, len(u) - 1)], known[k + 1])
     y = np.array(rows)
-    limits = () if plan is None else _limits(design, plan[1], np.vstack((now.y, y)), u, known)
+    limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
     finding = set_points(Setting(mpc, w, known[0]), memory.r, False)

@@ -148,12 +148,12 @@ def export_controller(
     options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
     mpc, known = law.mpc, last_known(law.design, memory)
     with tempfile.TemporaryDirectory() as temporary:
-        plan = export_c(mpc.plan, temporary, name=f"{name}_plan", **options)
-        target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
-        free = None
-        if mpc.free is not None:
-            free = export_c(mpc.free, temporary, name=f"{name}_free", **options)
-        reports = [plan, target, *([free] if free else [])]
+        parts = {"plan": mpc.plan, "target": mpc.targets, "free": mpc.free}
+        plan, target, free = (
+            part and export_c(part, temporary, name=f"{name}_{key}", **options)
+            for key, part in parts.items()
+        )
+        reports = [x for x in (plan, target, free) if x]
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
     course = _course(law, known)
     start = course["u"]
@@ -327,32 +327,16 @@ def _sizes(law: Law) -> dict[str, int]:
     design, observer = law.design, law.observer
     n, m, n_y, n_d = design.plant.sizes
     width = {key: place.stop - place.start for key, place in design.places.items()}
-    stages = design.horizon + 1
-    return {
-        "N_X": n,
-        "N_W": len(observer.F) - n,
-        "FREE": int(law.mpc.free is not None),
-        "N_F": law.mpc.anchors,
-        "ROUNDS": ROUNDS,
-        "N_E": len(observer.F),
-        "N_U": m,
-        "N_Y": n_y,
-        "N_D": n_d,
-        "N_D_": max(n_d, 1),
-        "GAINS": len(observer.gains),
-        "STAGES": stages,
-        "SET_POINTS": stages if design.references == "preview" else 1,
-        "N_R": width["r"],
-        "N_UR": width["u_r"],
-        "OFF": width["off"],
-        "WEIGHTED": len(design.weighted),
-        "PULLS": int(design.pulls[1].size > 0),
-        "MOVES": width["u_last"],
-        "BOUNDED_Y": width["y_s"],
-        "BOUNDED_U": width["u_s"],
-        "LEVELS": law.levels.shape[1],
-        "RUNS": int(levels.rules.sum(1).max()) if (levels := law.mpc.plan.levels) else 0,
-    }
+    stages, n_e, levels = design.horizon + 1, len(observer.F), law.mpc.plan.levels
+    of = {"N_R": "r", "N_UR": "u_r", "OFF": "off", "MOVES": "u_last"}
+    of |= {"BOUNDED_Y": "y_s", "BOUNDED_U": "u_s"}
+    sizes = {"N_X": n, "N_W": n_e - n, "N_E": n_e, "N_U": m, "N_Y": n_y, "N_D": n_d}
+    sizes |= {"N_D_": max(n_d, 1), "GAINS": len(observer.gains), "STAGES": stages}
+    sizes |= {"FREE": int(law.mpc.free is not None), "N_F": law.mpc.anchors, "ROUNDS": ROUNDS}
+    sizes |= {"SET_POINTS": stages if design.references == "preview" else 1}
+    sizes |= {"WEIGHTED": len(design.weighted), "PULLS": int(design.pulls[1].size > 0)}
+    sizes |= {"LEVELS": law.levels.shape[1], "RUNS": max(levels.rules.sum(1)) if levels else 0}
+    return sizes | {key: width[name] for key, name in of.items()}
 
 
 def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from torch_qpmpc.control.observer import (
 from torch_qpmpc.control.state_space import Array, read_table
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import Searches
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.solve import AtRest
 from torch_qpmpc.qp.program import Status
 
@@ -106,13 +108,14 @@ PLANNED = (Outcome.SOLVED, Outcome.MISSING, Outcome.NODE_LIMIT)
 
 
 class Move(NamedTuple):
-    """The result of a step: the input, the memory after it, and target and p of a plan, if any."""
+    """The result of a step: the input, the memory after it, and target, p and plan, if any."""
 
     u: Array
     memory: Memory
     status: Outcome
     target: Target | None = None
     p: Tensor | None = None
+    plan: BatchSolution | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +161,9 @@ class Law:
         return self.mpc.design
 
     @cached_property
-    def plans(self) -> AtRest:
+    def plans(self) -> AtRest | Searches:
         """The solver of the plan's QP, with the theta of its first use."""
-        return self.mpc.plan.at_rest()
+        return Searches(self.mpc.plan) if self.mpc.plan.levels else self.mpc.plan.at_rest()
 
     @cached_property
     def aims(self) -> list[AtRest]:
@@ -221,7 +224,8 @@ class Law:
             aimed.append(steady)
         steady = [*map(np.stack, zip(*aimed, strict=True))] if design.staged else aimed[0]
         p = design.arranged(np, e[:n], steady, memory.u, known)
-        z, found, ahead = self._planned(p, memory)
+        plan, ahead = self._planned(p, memory)
+        found, z = Status(int(plan.status[0])), plan.z[0]
         if found not in (Status.SOLVED, Status.NODE_LIMIT):
             proved = found == Status.INFEASIBLE
             return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
@@ -229,32 +233,14 @@ class Law:
         u = self._within(aimed[-1][1] + z[qp.n_p : qp.n_p + qp.n_u], memory)
         u, memory = self._on_level(u), memory._replace(ahead=ahead)
         target = Target(*map(torch.from_numpy, steady))
-        return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p))
+        return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p), plan)
 
-    @cached_property
-    def searches(self) -> Searches | None:
-        """The searches for plans on levels, with the theta of their first use; None without."""
-        return None if self.mpc.plan.levels is None else Searches(self.mpc.plan)
-
-    def _planned(self, p: Array, memory: Memory) -> tuple[Array, Status, Array | None]:
-        """Return the plan's z, its status, and the levels that it has from the next step on."""
-        if self.searches is None:
-            plan, ahead = self.plans.solve(p[None]), None
-        else:
-            plan, places = self.searches.solve(p[None], memory.runs, memory.ahead)
-            ahead = np.append(places[:, 1:], places[:, -1:], 1)
-        return plan.z[0], Status(int(plan.status[0])), ahead
-
-    def plan(self, p: Array, memory: Memory) -> tuple[Array, Array]:
-        """Return z and the rows' multipliers of the plan with p, from the memory after its step.
-
-        Those of decisions on levels are zero.
-        """
-        if self.searches is None:
-            plan = self.plans.solve(p[None])
-        else:
-            plan = self.searches.held(p[None], memory.u, memory.ahead)
-        return plan.z[0], plan.lam[0]
+    def _planned(self, p: Array, memory: Memory) -> tuple[BatchSolution, Array | None]:
+        """Return the plan, and the levels that it has from the next step on."""
+        if isinstance(self.plans, AtRest):
+            return self.plans.solve(p[None]), None
+        plan, places = self.plans.solve(p[None], memory.runs, memory.ahead)
+        return plan, np.append(places[:, 1:], places[:, -1:], 1)
 
     @cached_property
     def switches(self) -> Array:
@@ -265,11 +251,20 @@ class Law:
     @cached_property
     def levels(self) -> Array:
         """The levels of inputs within their bounds, ``(m, L)``, and inf behind them."""
-        of, sides = self.design.levels, zip(*self.design.u_bounds, strict=True)
-        sides = zip(self.design.plant.inputs, sides, strict=True)
-        within = [[x for x in of.get(name, ()) if low <= x <= high] for name, (low, high) in sides]
-        most = max(map(len, within))
-        return np.array([[*own, *[np.inf] * (most - len(own))] for own in within])
+        of = [self.design.levels.get(name, ()) for name in self.design.plant.inputs]
+        own = np.array([*zip_longest(*of, fillvalue=np.inf)]).T.reshape(len(of), -1)
+        lower, upper = (side[:, None] for side in self.design.u_bounds)
+        return np.sort(np.where((lower <= own) & (own <= upper), own, np.inf))
+
+    def check_runs(self, memory: Memory) -> None:
+        """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
+        for i, (name, run) in enumerate(zip(self.design.plant.inputs, memory.runs, strict=True)):
+            word, levels = "on" if run > 0 else "off", self.levels[i, np.isfinite(self.levels[i])]
+            left = self.design.switching[f"min_{word}"][i] - abs(run) if len(levels) else 0
+            if left > 0 and not ((levels > self.switches[i]) == (run > 0)).any():
+                got = f"levels {', '.join(f'{x:g}' for x in levels)} of {name}"
+                want = f"one that is {word} for {left:g} more steps, by min_{word}"
+                raise QPError.expected("u_bounds", got, want, "Change them then.")
 
     def _on_level(self, u: Array) -> Array:
         """Return inputs at their nearest levels within their bounds."""

@@ -93,13 +93,11 @@ class LinearMPC:
         gamma: the discount.
         u_target: inputs that the set-points leave free rest near these, weighted by R; by name, a
             number or a vector. By default the means of the model's log, and zero without one.
-        u_levels: the levels of inputs that take no other values, ``{"q": (0.0, 4.0, 8.0)}``; the
-            lowest is *off*.
-        min_on, min_off: the fewest steps that such an input stays on, at any level but the lowest,
-            and off, by name or for all.
-        start_cost: the cost of going on from off, likewise.
-        integer_horizon: the number of stages that are decided on levels, N by default; later ones
-            are relaxed to the numbers between.
+        u_levels: the levels of inputs that take no others, ``{"q": (0.0, 4.0, 8.0)}``; the lowest
+            is off.
+        min_on, min_off: the fewest steps that such an input stays on and off, by name.
+        start_cost: the cost of going on, likewise.
+        integer_horizon: the stages that are decided on levels, N by default; others are relaxed.
         max_nodes: the most QPs that a search for the best plan on levels solves.
         options: ``learn``, ``structure``, ``step``, ``solver`` and ``on_failure`` of the plan's
             `QPMPC`; by default a tied structure that learns nothing, and DAQP.
@@ -164,12 +162,9 @@ class LinearMPC:
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         wishes = read_wishes(plant, None, **weights, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
-        levels, switching = read_switching(
-            u_levels, plant, **rules, integer_horizon=integer_horizon
-        )
-        switching["max_nodes"] = max_nodes
-        wishes["u_bounds"] = within_levels(wishes["u_bounds"], levels, plant)
-        limits = wishes["y_bounds"], wishes["u_bounds"], wishes["Q"]
+        levels, switching = read_switching(u_levels, plant, rules, integer_horizon, max_nodes)
+        of_u = within_levels(wishes["u_bounds"], levels, plant, wishes["du_bounds"])
+        limits = wishes["y_bounds"], of_u, wishes["Q"]
         scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
             plant=plant,

@@ -26,7 +26,6 @@ bounds, it is then the policy of a second QPMPC with the state [a; w; d; 1]: lea
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -203,6 +202,9 @@ def _bounds(design: Design) -> Bounds:
     limits = du, *(side[moving] for side in design.du_bounds)
     D, lower, upper = map(np.concatenate, zip(soft, hard, limits, strict=True))
     n_y, price = len(soft[0]), design.y_slack[places][priced]
+    rows = n_y - 1 + np.cumsum(np.isfinite(design.u_bounds).any(0))
+    of_u = [design.levels.get(name) for name in design.plant.inputs]
+    levels = {"action_levels": of_u, "level_rows": rows.tolist()} if design.levels else {}
     held = D[:, size:].any(-1) & ~D[:, : design.places["known"].stop].any(-1)
     return Bounds(
         constraints=(D, lower, upper) if len(D) else None,
@@ -210,22 +212,9 @@ def _bounds(design: Design) -> Bounds:
         constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
         discount_slack=True,
         held=held if len(D) else None,
-        **_levels(design, n_y),
+        **levels,
+        **design.switching,
     )
-
-
-def _levels(design: Design, n_y: int) -> dict[str, Any]:
-    """Return the arguments of `Bounds` for inputs on levels, whose rows follow ``n_y`` others."""
-    if not design.levels:
-        return {}
-    names, switching = design.plant.inputs, dict(design.switching)
-    rows = np.cumsum(np.isfinite(design.u_bounds).any(0)) - 1 + n_y
-    defaults = {"min_on": 1, "min_off": 1, "start_cost": 0.0}
-    for name, default in defaults.items():
-        if isinstance(own := switching[name], Mapping):
-            switching[name] = [own.get(x, default) for x in names]
-    levels = [design.levels.get(name) for name in names]
-    return {"action_levels": levels, "level_rows": rows.tolist(), **switching}
 
 
 def anchored(design: Design) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +16,9 @@ from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
 from torch_qpmpc.control.lowering import riccati
-from torch_qpmpc.control.simulation import last_known
+from torch_qpmpc.control.simulation import centre, last_known, simulate
 from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.errors import SolverError
 from torch_qpmpc.export.tables import SINGULAR, make_tables
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import Status
@@ -31,6 +32,8 @@ NOISY = 1.1
 OFFSET, SEEN = 1e-6, 1e-3
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
+#: The length of the loop on levels, in horizons, of which the second half counts.
+PERIODS = 6
 #: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
 LARGEST = 2.0
 
@@ -92,6 +95,8 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         _hard_rows(mpc, r_last, known),
         set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
+    if design.levels:
+        findings.append(_levels(law, r_last, known))
     if not cost.ok:
         return Review(findings)
     plan, target = make_tables(mpc.plan), make_tables(mpc.targets)
@@ -222,6 +227,33 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     what = f"outputs {_listed(off[i])} off r" if at_y else f"last inputs {_listed(u_last[i])}"
     text = f"There is no plan from {what}."
     return Finding("hard bounds", False, text, f"Give {names} a finite y_slack.")
+
+
+def _levels(law: Law, r: Array, known: Array) -> Finding:
+    """In a loop of the model, inputs on levels hold outputs within their bounds; and its price."""
+    design, costs, least = law.design, [], 1e-9 * law.design.typical
+    plant, r = design.plant, r[-1] if len(r) else centre(design, known)
+    relaxed = LinearMPC.of_design(replace(design, levels={}, switching={}), **law.mpc.options)
+    try:
+        for own in (replace(law, mpc=relaxed), law):
+            run = simulate(own, law.begun(), None, PERIODS * design.horizon, r, known=known)
+            y, u, cost = (x[len(run.u) // 2 :] for x in (run.y, run.u, run.cost))
+            costs.append(cost.mean() * bool(cost.mean() > least))
+    except SolverError as error:
+        return Finding("levels", False, str(error), "Shorten min_on or min_off.")
+    starts = np.diff((u > law.switches).astype(int), axis=0) > 0
+    costs[1] += (starts @ np.array(design.switching["start_cost"])).mean()
+    held = *zip(plant.outputs, y.T, strict=True), *zip(plant.inputs, u.T, strict=True)
+    parts = [
+        f"{plant.quantity(name, x.min())} to {x.max():.4g}, mean {x.mean():.4g}" for name, x in held
+    ]
+    text = f"In a loop of the model: {'; '.join(parts)}. A step costs {costs[1]:.4g}, and "
+    text += f"{costs[0]:.4g} without levels."
+    lower, upper = design.bounds_at(known)[0]
+    off = np.maximum(lower - y, y - upper).max(0) > SEEN * design.scaling.y
+    names = " and ".join(np.array(plant.outputs)[off])
+    remedy = f"Shorten min_on or min_off, add a level, or widen y_bounds of {names}."
+    return Finding("levels", not names, text, remedy * bool(names))
 
 
 class Setting(NamedTuple):

@@ -248,6 +248,8 @@ class Searches:
     ) -> tuple[BatchSolution, np.ndarray]:
         """Return the best plan's solution, and the places of its levels ``(m, S)``.
 
+        Multipliers of decisions are zero.
+
         Args:
             fixed: the first entries of z, ``(1, n_f)``.
             runs: for how many steps each action was on, or with a minus off, ``(n_u,)``; 0, the
@@ -260,30 +262,15 @@ class Searches:
         places, active, _, (outcome,), *_ = levels.search(programs, runs[None], hint[None])
         if outcome not in (kernel.BEST, kernel.CAPPED):
             return programs.unsolved(int(STATUSES[outcome])), places[0]
-        solution = self._held(fixed, places[0], active)
+        lb, ub = self._prepared.theta.lb.copy(), self._prepared.theta.ub.copy()
+        held = np.take_along_axis(levels.values, places[0], 1)
+        lb[:, levels.rows] = ub[:, levels.rows] = held
+        programs = Programs(self._prepared.bounded(lb, ub), programs.group, fixed)
+        solution = solve_programs(programs, self._solver, active)
+        solution.lam[0, levels.rows] = 0.0
         if not solution.status[0]:
             solution.status[0] = STATUSES[outcome]
         return solution, places[0]
-
-    def held(self, fixed: np.ndarray, u: np.ndarray, ahead: np.ndarray | None) -> BatchSolution:
-        """Return the solution with the action u and then the levels ``ahead``, ``(m, S)``.
-
-        Multipliers of decisions are zero.
-        """
-        assert ahead is not None
-        first = np.abs(u[self._levels.actions, None] - self._levels.values).argmin(1)
-        solution = self._held(fixed, np.column_stack((first, ahead[:, :-1])))
-        solution.lam[0, self._levels.rows] = 0.0
-        return solution
-
-    def _held(
-        self, fixed: np.ndarray, places: np.ndarray, active: np.ndarray | None = None
-    ) -> BatchSolution:
-        lb, ub = self._prepared.theta.lb.copy(), self._prepared.theta.ub.copy()
-        rows, values = self._levels.rows, self._levels.values
-        lb[:, rows] = ub[:, rows] = np.take_along_axis(values, places, 1)
-        programs = Programs(self._prepared.bounded(lb, ub), np.zeros(1, np.int64), fixed)
-        return solve_programs(programs, self._solver, active)
 
 
 def check_used(levels: str, given: dict[str, Any]) -> None:
