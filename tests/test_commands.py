@@ -115,6 +115,7 @@ SHORT = {
         FEW, files=MY_TASK
     ),
     "python my_task.py -m task=pole solver=daqp seed=1,2,3": Short(SWEEP, files=MY_TASK),
+    "python docs/examples/heat_pump.py heat_pump.png": Short(),
     "python docs/examples/torchrl/ddpg.py": Short(instead=f'python -c "{SCRIPT}"'),
     # Benchmarks that can be shortened: one row of each.
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),

@@ -37,6 +37,23 @@ def test_an_example_learns_for_two_updates(name, tmp_path):
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 200
 
 
+def test_the_heat_pump_costs_less_than_a_thermostat_and_no_less_than_the_bound():
+    drawn = runpy.run_path(str(FOLDER / "heat_pump.py"))
+    one, steps = drawn["days"](2, 5), 96
+    plan, bound = drawn["omniscient"](one, steps)
+    controller, cost = drawn["from_log"](), drawn["cost"]
+    runs = {"on levels": drawn["optimized"](controller, one, steps)}
+    runs["thermostat"] = drawn["thermostat"](one, steps)
+    assert bound <= cost(one, plan) * (1 + 1e-9) <= cost(one, runs["on levels"])
+    assert cost(one, runs["on levels"]) < cost(one, runs["thermostat"])
+    assert not controller.review().faults
+    for run in (plan, *runs.values()):
+        ends = np.flatnonzero(np.diff(run[:, 1]))
+        spans = list(zip(np.diff(ends), run[ends[1:], 1], strict=True))
+        assert all(length >= (3 if on else 2) for length, on in spans)
+    rendered(drawn["figure"](one, runs, slice(0, steps)))
+
+
 def test_the_figure_of_bad_hours_shows_what_prediction_and_observation_save():
     drawn = runpy.run_path(str(FOLDER / "bad_hours.py"))
     rendered(drawn["figure"]())

@@ -28,8 +28,9 @@ from torch_qpmpc.qp.solve import solve_qp
 MARGIN, HIDDEN = 0.3, 1e-3
 #: The most that a loop may cost under the log's noise, relative to a constant input.
 NOISY = 1.1
-#: Offsets of the loop and of set-points, relative to half the distance of an output's bounds.
-OFFSET, SEEN = 1e-6, 1e-3
+#: Offsets of the loop, of set-points, and of outputs from their bounds while inputs are on levels,
+#: relative to half the distance of an output's bounds.
+OFFSET, SEEN, OUTSIDE = 1e-6, 1e-3, 0.05
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
 #: The length of the loop on levels, in horizons, of which the second half counts.
@@ -95,8 +96,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         _hard_rows(mpc, r_last, known),
         set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
-    if design.levels:
-        findings.append(_levels(law, r_last, known))
+    findings += [_levels(law, r_last, known)] if design.levels else []
     if not cost.ok:
         return Review(findings)
     plan, target = make_tables(mpc.plan), make_tables(mpc.targets)
@@ -231,26 +231,25 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
 
 def _levels(law: Law, r: Array, known: Array) -> Finding:
     """In a loop of the model, inputs on levels hold outputs within their bounds; and its price."""
-    design, costs, least = law.design, [], 1e-9 * law.design.typical
+    design, costs, steps = law.design, [], PERIODS * law.design.horizon
     plant, r = design.plant, r[-1] if len(r) else centre(design, known)
+    x, u_s = (part.numpy() for part in law.mpc.target(r, known=known)[:2])
     relaxed = LinearMPC.of_design(replace(design, levels={}, switching={}), **law.mpc.options)
     try:
         for own in (replace(law, mpc=relaxed), law):
-            run = simulate(own, law.begun(), None, PERIODS * design.horizon, r, known=known)
-            y, u, cost = (x[len(run.u) // 2 :] for x in (run.y, run.u, run.cost))
-            costs.append(cost.mean() * bool(cost.mean() > least))
+            run = simulate(own, law.begun(), None, steps, r, u=u_s, x=x, known=known)
+            y, u, cost = (part[steps // 2 :] for part in (run.y, run.u, run.cost))
+            costs.append(cost.mean() * bool(cost.mean() > OFFSET * design.typical))
     except SolverError as error:
         return Finding("levels", False, str(error), "Shorten min_on or min_off.")
     starts = np.diff((u > law.switches).astype(int), axis=0) > 0
     costs[1] += (starts @ np.array(design.switching["start_cost"])).mean()
     held = *zip(plant.outputs, y.T, strict=True), *zip(plant.inputs, u.T, strict=True)
-    parts = [
-        f"{plant.quantity(name, x.min())} to {x.max():.4g}, mean {x.mean():.4g}" for name, x in held
-    ]
-    text = f"In a loop of the model: {'; '.join(parts)}. A step costs {costs[1]:.4g}, and "
-    text += f"{costs[0]:.4g} without levels."
+    spans = (f"{plant.quantity(x, a.min())} to {a.max():.4g}, mean {a.mean():.4g}" for x, a in held)
+    text = f"In a loop of the model: {'; '.join(spans)}. A step costs {costs[1]:.4g}, "
+    text += f"without levels {costs[0]:.4g}."
     lower, upper = design.bounds_at(known)[0]
-    off = np.maximum(lower - y, y - upper).max(0) > SEEN * design.scaling.y
+    off = np.maximum(lower - y, y - upper).max(0) > OUTSIDE * design.scaling.y
     names = " and ".join(np.array(plant.outputs)[off])
     remedy = f"Shorten min_on or min_off, add a level, or widen y_bounds of {names}."
     return Finding("levels", not names, text, remedy * bool(names))
@@ -373,7 +372,7 @@ def _noise(loop: LinearLoop, law: Law, noise: tuple[Array, Array]) -> Finding:
     """Under the identified noise the loop costs hardly more than a constant input does."""
     design, cost = law.design, loop.cost_of_noise(law.design, noise)
     nothing = loop.cost_of_noise(design, noise, active=False)
-    ok = bool(cost <= NOISY * nothing)
+    ok = bool(cost <= NOISY * nothing + OFFSET * design.typical)
     text = f"Under the log's noise a step costs {cost:.4g}, and {nothing:.4g} with constant inputs."
     remedy = _slower("drift", design.disturbances.names, law.drift / 10)
     return Finding("noise", ok, text, remedy * (not ok))
