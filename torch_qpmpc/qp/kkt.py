@@ -110,7 +110,7 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     """
     lb, ub, w = map(to_tensor, programs.theta[6:9])
     if (units := programs.prepared.units) is not None:  # zero and equal are relative to these
-        rows, cost = (to_tensor(x)[programs.group] for x in (units.rows, units.cost))
+        cost, _, rows, _ = map(to_tensor, units.per_qp(units.group))
         y, lb, ub, lam, w = y / rows, lb / rows, ub / rows, lam * (rows / cost), w * (rows / cost)
     held, saturated = active_rows(lam, lb, ub, w)
     condensed = programs.prepared.condensed(programs.n_f)

@@ -19,7 +19,7 @@ from tests.problems import (
     random_mpc,
     random_states,
 )
-from torch_qpmpc.qp.kernels import sample_torch
+from torch_qpmpc.qp.kernels import sample, sample_torch
 from torch_qpmpc.qp.kernels.sample import CLOSE
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -147,3 +147,12 @@ def test_the_full_solution_of_diagonal_matrices_is_that_of_torch():
     H, _, G, *_ = compiled.prepared.sizes(compiled.n_f).spans
     assert all((np.diff(spans) <= 1).all() for spans in (H, G))
     assert_recovered_alike(compiled, daqp.solve(compiled.reduced_qps()))
+
+
+def test_rounding_makes_no_more_rows_independent_than_there_are_variables(monkeypatch):
+    """Rows of an unstable plant over 50 steps once wrote beyond the array of the basis."""
+    monkeypatch.setattr(sample, "DEPENDENT", 0.0)  # all of rounding counts
+    units, n = np.random.default_rng(0).standard_normal((9, 3)), 9
+    y, scratch = units @ np.ones(3), (np.empty((4, 3)), np.empty(4), np.empty(4))
+    rows = y, np.zeros(n), y - 2.0, y, np.full(n, np.inf), np.ones(n)
+    assert sample._repair.py_func(rows, np.arange(n), np.ones(3), units, units, *scratch) > 0

@@ -269,13 +269,13 @@ def largest_term(known: KnownQP, z: Tensor) -> Tensor:
 
 
 def test_a_violation_counts_by_the_step_that_ends_it():
-    # z_1 = 0 and 1e-9 z_2 <= -1e-9: z_2 is -1, and V 1/2. At z = 0 the row is violated by 1e-9.
-    C, none = torch.tensor([[1.0, 0.0]]).double(), torch.zeros(1).double()
-    G, inf = torch.tensor([[-1.0, 1e-9]]).double(), torch.full((1,), torch.inf).double()
-    data = (torch.eye(2).double(), torch.zeros(2).double(), none.sum(), C, none, G, -inf)
-    programs, _ = Programs.of(*data, torch.tensor([-1e-9]).double(), inf, none[:0])
-    z = torch.zeros(1, 2).double()
-    certificate = certify(programs, z, 0 * z[:, :1], 0 * z[:, :1], z[:, :0])
+    # z_1 = 1 and z_1 - 1e-9 z_2 >= 1 + 1e-9: z_2 is -1. At z_2 = 0 the row is violated by 1e-9.
+    C, one = torch.tensor([[1.0, 0.0]]).double(), torch.ones(1).double()
+    G, inf = torch.tensor([[1.0, -1e-9]]).double(), torch.full((1,), torch.inf).double()
+    data = (torch.eye(2).double(), torch.zeros(2).double(), one.sum(), C, one, G, one + 1e-9)
+    programs, _ = Programs.of(*data, inf, inf, one[:0])
+    z = torch.tensor([[1.0, 0.0]]).double()
+    certificate = certify(programs, z, 0 * z[:, :1], -z[:, :1], z[:, :0])
     assert certificate.residual <= TOLERANCE
     assert certificate.value_error > 1
 

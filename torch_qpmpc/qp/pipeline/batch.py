@@ -24,7 +24,6 @@ from torch_qpmpc.qp.pipeline.arrays import (
     BatchSolution,
     SoftQPs,
     Theta,
-    per_qp,
     to_numpy,
 )
 from torch_qpmpc.qp.pipeline.condensing import (
@@ -108,8 +107,7 @@ class Prepared:
     def scaled(self) -> Prepared:
         """The same theta, in its `units`."""
         assert self.units is not None
-        theta = self.units.scaled(self.theta, self.group)
-        return Prepared(theta, self.group, self.n_kept)
+        return Prepared(self.units.scaled(self.theta), self.units.group, self.n_kept)
 
     def condensed(self, n_f: int) -> Condensed:
         """Return the QPs without C z = b, for n_f fixed entries."""
@@ -163,7 +161,7 @@ class Prepared:
         other.known = {key: x for key, x in self.known.items() if key[0] in same}
         vars(other)["units"] = self.units
         if self.units is not None:
-            rows = per_qp(self.units.rows, self.group)
+            _, _, rows, _ = self.units.per_qp(self.units.group)
             vars(other)["scaled"] = self.scaled.bounded(lb / rows, ub / rows)
         return other
 
@@ -263,8 +261,9 @@ class Programs:
         units = self.prepared.units
         if units is None:
             return self
-        length = per_qp(units.length, self.group)[:, : self.n_f]
-        return Programs(self.prepared.scaled, self.group, self.fixed / length)
+        group = self.group if len(units.group) == 1 else units.group  # of a shared theta, zeros
+        _, length, *_ = units.per_qp(group)
+        return Programs(self.prepared.scaled, group, self.fixed / length[:, : self.n_f])
 
     def eliminated(self, elimination: Elimination) -> Programs:
         """Return the same QPs with another elimination of C z = b."""

@@ -9,7 +9,8 @@ and of the rows rho (of G) and gamma (of C),
 
 is the same QP. All units are powers of two, so that rounding does not change. The entries of z
 share one length, unless the columns of H, C and G differ by orders of magnitude, as for states in
-watts beside actions between -1 and 1: then each has its own, from equilibration.
+watts beside actions between -1 and 1: then each has its own, from equilibration. QPs that share
+their matrices, but whose optima differ by orders of magnitude, do not share a length.
 """
 
 from __future__ import annotations
@@ -26,23 +27,26 @@ SMALL, LARGE = 2.0**-7, 2.0**10
 APART = 2.0**14
 #: .. after so many passes of equilibration.
 PASSES = 8
-#: The unit of a row is no smaller than this fraction of its terms.
-SMALLEST = 2.0**-20
+#: QPs share a length if theirs, as powers of two, have the same quotient by this.
+ALIKE = 7
 #: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
 ROUNDING = 2.0**-40
 
 
 class Units(NamedTuple):
-    """Units of each of the M matrix triples.
+    """Units of K classes of QPs, each of which shares matrices and a length.
 
-    ``cost`` ``(M, 1)``, ``length`` ``(M, 1)`` or ``(M, n_z)``, ``rows`` ``(M, n_g)`` and
-    ``equalities`` ``(M, n_c)``.
+    ``cost`` ``(K, 1)``, ``length`` ``(K, 1)`` or ``(K, n_z)``, ``rows`` ``(K, n_g)`` and
+    ``equalities`` ``(K, n_c)``; ``group`` is the class of each QP, and ``triple`` ``(K,)`` the
+    index of a class's matrices among the M.
     """
 
     cost: np.ndarray
     length: np.ndarray
     rows: np.ndarray
     equalities: np.ndarray
+    group: np.ndarray
+    triple: np.ndarray
 
     @classmethod
     @np.errstate(all="ignore")
@@ -50,14 +54,16 @@ class Units(NamedTuple):
         """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
-        if (own := cls.of_columns(theta)) is not None:
-            units = cls.of_rows_and_cost(own.scaled(theta, group), group)
-            return own if units is None else units._replace(length=units.length * own.length)
+        if (own := cls.of_columns(theta, group)) is not None:
+            units = cls.of_rows_and_cost(own.scaled(theta), group)
+            if units is None:
+                return own
+            return units._replace(length=units.length * own.length[units.triple])
         return cls.of_rows_and_cost(theta, group)
 
     @classmethod
     @np.errstate(all="ignore")
-    def of_columns(cls, theta: Theta) -> Units | None:
+    def of_columns(cls, theta: Theta, group: np.ndarray) -> Units | None:
         """Return units of the entries of z that follow from the matrices; None if alike."""
         of_C, of_G = (column_sizes(x) for x in (theta.C, theta.G))
         curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
@@ -66,47 +72,52 @@ class Units(NamedTuple):
         columns = lengths(theta.H, np.concatenate((theta.C, theta.G), axis=1))
         one = np.ones((len(columns), 1))
         n_c, n_g = theta.C.shape[1], theta.G.shape[1]
-        return cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1))
+        triple = np.arange(len(columns))
+        return cls(one, columns, one.repeat(n_g, 1), one.repeat(n_c, 1), group, triple)
 
     @classmethod
     @np.errstate(all="ignore")
     def of_rows_and_cost(cls, theta: Theta, group: np.ndarray) -> Units | None:
         """Return units with one length for all entries of z; None if all of them are one."""
-        M, (rows, equalities) = len(theta.H), (row_sums(x) for x in (theta.G, theta.C))
+        rows, equalities = row_sums(theta.G), row_sums(theta.C)
         near = np.fmin(
-            *(np.where(np.isfinite(x) & (x != 0), np.abs(x), np.nan) for x in theta[6:8])
+            *(np.where(np.isfinite(x) & (x != 0), np.abs(x), np.nan) for x in (theta.lb, theta.ub))
         )
-        q, b, near = (finite_sizes(x, group, M) for x in (theta.q, theta.b, near))
-        H, q = (x.max(-1, keepdims=True) for x in (column_sizes(theta.H), q))
+        near, b = np.where(np.isnan(near), 0.0, near), np.abs(theta.b)
         b = np.where(b > ROUNDING * b.max(-1, keepdims=True, initial=0.0), b, 0)
-        reach = np.concatenate((near / rows, b / equalities), axis=-1)
-        sizes = np.concatenate((np.maximum(H, q), rows, equalities, reach), axis=-1)
-        if (sizes[:, 0] > 0).all() and not _unusual(sizes).any():
+        reach = np.concatenate((near / rows[group], b / equalities[group]), axis=-1)
+        H = column_sizes(theta.H).max(-1, keepdims=True)
+        q = finite_sizes(theta.q, group, len(H)).max(-1, keepdims=True)
+        sizes = np.maximum(H, q), rows, equalities, reach
+        if (sizes[0] > 0).all() and not any(_unusual(x).any() for x in sizes):
             return None
         # A bound, however large, demands no large z, and a large z is compared with itself.
-        length = np.minimum(_typical(reach), 1.0)
-        cost = np.maximum(H * length**2, q * length)
-        of_rows = (finite_sizes(theta.w, group, M) * rows * length).max(
-            -1, keepdims=True, initial=0.0
-        )
+        own = np.minimum(_typical(reach), 1.0)
+        kinds = np.stack((group, np.frexp(own[:, 0])[1] // ALIKE), axis=-1)
+        kinds, group = np.unique(kinds, axis=0, return_inverse=True)
+        triple, group = kinds[:, 0], group.reshape(-1)
+        length, q, w = (finite_sizes(x, group, len(triple)) for x in (own, theta.q, theta.w))
+        H, rows, equalities = H[triple], rows[triple] * length, equalities[triple] * length
+        cost = np.maximum(H * length**2, q.max(-1, keepdims=True) * length)
+        of_rows = (w * rows).max(-1, keepdims=True, initial=0.0)
         cost = np.where(cost > 0, cost, np.maximum(cost, of_rows))  # a QP without any other cost
-        # A hard row near a small bound is judged relative to that.
-        rows, equalities = rows * length, equalities * length
-        hard = np.isinf(theta.w).any(0) & (near > 0)
-        rows = np.where(hard, np.minimum(rows, np.maximum(near, SMALLEST * rows)), rows)
         cost, rows, equalities = (_power_above(x) for x in (cost, rows, equalities))
-        units = cls(cost, length, rows, equalities)
-        return units if any((unit != 1).any() for unit in units) else None
+        units = cost, length, rows, equalities
+        return cls(*units, group, triple) if any((unit != 1).any() for unit in units) else None
 
-    def scaled(self, theta: Theta, group: np.ndarray) -> Theta:
-        """Return theta in these units."""
-        cost, length, rows, equalities = (per_qp(unit, group) for unit in self)
+    def per_qp(self, group: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return cost, length, rows and equalities of the QPs of these classes."""
+        return tuple(per_qp(unit, group) for unit in self[:4])
+
+    def scaled(self, theta: Theta) -> Theta:
+        """Return theta in these units, with the matrices of each class."""
+        cost, length, rows, equalities = self.per_qp(self.group)
         by_row = self.length[:, None] / self.rows[:, :, None]
         by_equality = self.length[:, None] / self.equalities[:, :, None]
         return Theta(
-            theta.H * (self.length[:, :, None] * (self.length / self.cost)[:, None]),
-            theta.C * by_equality,
-            theta.G * by_row,
+            theta.H[self.triple] * (self.length[:, :, None] * (self.length / self.cost)[:, None]),
+            theta.C[self.triple] * by_equality,
+            theta.G[self.triple] * by_row,
             theta.q / (cost / length),
             theta.c / cost[:, 0],
             theta.b / equalities,
@@ -116,8 +127,11 @@ class Units(NamedTuple):
         )
 
     def restored(self, solution: BatchSolution, group: Array) -> BatchSolution:
-        """Return solutions in the original numbers, with the same relative residuals."""
-        cost, length, rows, equalities = (per_qp(unit, group) for unit in self)
+        """Return solutions of QPs of these classes in the original numbers.
+
+        Their relative residuals are the same.
+        """
+        cost, length, rows, equalities = self.per_qp(group)
         return solution._replace(
             value=solution.value * cost[:, 0],
             z=solution.z * length,

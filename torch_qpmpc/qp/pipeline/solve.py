@@ -232,7 +232,8 @@ def solve_programs(
     if (units := programs.prepared.units) is None:
         solution = _solved(programs, steps, start)
     else:
-        solution = units.restored(_solved(programs.scaled(), steps, start), programs.group)
+        scaled = programs.scaled()
+        solution = units.restored(_solved(scaled, steps, start), scaled.group)
     if log is not unused:
         log.add(solution, time.perf_counter() - began)
     return solution
