@@ -364,7 +364,7 @@ def test_a_refinement_judges_opposed_rows_alike(length, off, right):
     lb, ub = vector(-torch.inf, middle * (1 + off)), vector(middle, torch.inf)
     data = (one, vector(-1.0), one[0, 0], one[:0], none, G, lb, ub, inf, none)
     programs = Programs.of(*data)[0]
-    z, lam = np.full((1, 1), 0.5), np.array([[1.0, -0.5]])
+    z, lam = np.full((1, 1), 0.5), np.array([[1.0, -0.5]]) / length
     near = programs.unsolved(Status.NOT_CONVERGED)._replace(z=z, lam=lam)
     refine(programs, near, np.arange(1))
     assert (near.status[0] == Status.SOLVED) == right

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
 from torch_qpmpc.qp.kernels.linalg import compiled
@@ -38,8 +37,6 @@ SINGULAR = 2e-15
 FLAT = 1e-14
 #: A z this many times as large as that of least norm is not a start.
 RUNAWAY = 1e3
-#: A row this close to its bound, relatively, may be active at a vertex.
-NEAR = 1e-6
 #: A multiplier is zero up to rounding if its force is this small, relative to the largest.
 WEAK = 1e-10
 #: Splits a number into two halves of 26 bits.
@@ -103,13 +100,7 @@ class _QP(NamedTuple):
     @np.errstate(all="ignore")  # a set without a solution has none that is finite
     def solve(self, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
         """Solve from the active set of z and lam; return None if no set does."""
-        solution = self._settled(self._first_codes(z, lam), z, lam)
-        if solution is None:
-            solution = self._settled(self._vertex_codes(z), z, lam)
-        return solution
-
-    def _settled(self, codes: np.ndarray, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
-        slip, x = EXACT, None
+        codes, slip, x = self._first_codes(z, lam), EXACT, None
         work = (len(self.q) + len(self.b) + np.count_nonzero(codes)) ** 3
         for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
             system = _System.of(self, codes)
@@ -141,33 +132,6 @@ class _QP(NamedTuple):
         saturated = (self.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
         code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
         return code.astype(np.int8)
-
-    def _vertex_codes(self, z: np.ndarray) -> np.ndarray:
-        """Return the codes of the multipliers that best balance the cost's slope at z.
-
-        Of the rows at a degenerate vertex, they hold independent ones.
-        """
-        n_f, n_c, size = len(self.fixed), len(self.b), np.maximum(self.row_sizes(z), TINY)
-        above, below = (self.G @ z - self.ub) / size, (self.lb - self.G @ z) / size
-        soft, weighty = np.isfinite(self.w), self.w > 0
-        codes = 2 * weighty * soft * ((above > NEAR).astype(np.int8) - (below > NEAR))
-        rows = np.flatnonzero(weighty & (codes == 0) & (np.maximum(above, below) >= -NEAR))
-        slope = self.H @ z + self.q + self.G.T @ np.where(codes != 0, np.sign(codes) * self.w, 0)
-        norm = np.abs(self.G[rows]).sum(-1)
-        matrix = np.vstack((self.C, self.G[rows] / np.maximum(norm, TINY)[:, None]))[:, n_f:].T
-        limit = self.w[rows] * norm
-        low = np.where(below[rows] >= -NEAR, -limit, 0)
-        high = np.where(above[rows] >= -NEAR, limit, 0)
-        free = np.full(n_c, np.inf)
-        bounds = np.concatenate((-free, low)), np.concatenate((free, high))
-        codes = codes.astype(np.int8)
-        if not matrix.size or not np.isfinite(matrix).all() or not np.isfinite(slope).all():
-            return codes
-        best = scipy.optimize.lsq_linear(matrix, -slope[n_f:], bounds, method="bvls", tol=1e-15)
-        lam = best.x[n_c:]
-        at_limit = (lam == low) | (lam == high)
-        codes[rows] = np.sign(lam) * np.where(at_limit, 2, 1)
-        return codes
 
     def row_sizes(self, z: np.ndarray) -> np.ndarray:
         """Return the size of the terms that each row compares: |G| |z|, and the nearer bound."""
