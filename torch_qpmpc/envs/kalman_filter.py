@@ -13,7 +13,6 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.identification.filter import SINGULAR
 from torch_qpmpc.identification.innovations import Innovations
 
 #: The steps of an episode whose gains differ from the last one's, at most.
@@ -57,8 +56,6 @@ class KalmanFilter(Transform):
     C: Tensor
     x0: Tensor
     gains: Tensor
-    L: Tensor
-    S: Tensor
     P0: Tensor
 
     def __init__(
@@ -72,9 +69,9 @@ class KalmanFilter(Transform):
         self.observation_key = observation_key
         self.estimate_key = observation_key if estimate_key is None else estimate_key
         super().__init__(in_keys=[observation_key], out_keys=[self.estimate_key])
-        self.missing = missing
+        self.missing, self._model = missing, model
         self.memory_key = "filter_covariance" if missing else "filter_step"
-        for name in ("A", "B", "E", "offset", "C", "x0", "L", "S", "P0"):
+        for name in ("A", "B", "E", "offset", "C", "x0", "P0"):
             self.register_buffer(name, torch.as_tensor(getattr(model, name)))
         gains = np.concatenate((model.gains(STEPS), model.L[None]))
         self.register_buffer("gains", torch.as_tensor(gains))
@@ -84,18 +81,13 @@ class KalmanFilter(Transform):
 
         P is ``(*batch, n, n)``, as in `Innovations.course`.
         """
-        C, LS = self.C * seen[..., None], (self.L @ self.S) * seen[..., None, :]
-        S = self.S * seen[..., None] * seen[..., None, :]
-        absent = torch.diag_embed(torch.where(seen, 0.0, self.S.diagonal()))
-        V = C @ P @ C.mT + S + absent
-        size = V.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
-        unit = torch.where(size > 0, 1 / size, 0.0)
-        unit = unit[..., None] * unit[..., None, :]
-        inverse = unit * torch.linalg.pinv(unit * V, rtol=SINGULAR, hermitian=True)
-        L = self.L * seen[..., None, :]
-        K = L + (P @ C.mT + LS - L @ V) @ inverse  # the steady gain without variance
-        P = self.A @ (P + self.L @ self.S @ self.L.mT - K @ V @ K.mT) @ self.A.mT
-        return K, (P + P.mT) / 2
+        batch, n = seen.shape[:-1], len(self.A)
+        before, rows = P.reshape(-1, n, n).double(), seen.reshape(-1, 1, seen.shape[-1])
+        pairs = zip(before.numpy(force=True), rows.numpy(force=True), strict=True)
+        runs = [self._model.course(own, one) for one, own in pairs]
+        K, after = (np.stack(x) for x in zip(*((run.K[0], run.after) for run in runs), strict=True))
+        K, after = torch.as_tensor(K).to(P), torch.as_tensor(after).to(P)
+        return K.reshape(*batch, n, -1), after.reshape(P.shape)
 
     def first(self, y: Tensor) -> Tensor:
         """Return the estimates ``(*batch, n)`` after the first outputs.
