@@ -32,7 +32,7 @@ BUDGET = {
     ".": 413,
     "analysis": 851,
     "control": 4745,
-    "envs": 1440,
+    "envs": 1432,
     "experiment": 2985,
     "export": 1515,
     "learning": 2842,  # models that did not train theta decide in improve

@@ -72,7 +72,7 @@ def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
     assert new.plant.known == ("price", "sun")
     assert np.array_equal(new.plant.E[:, 0], [0.0])
     for name in ("Q", "R", "dR", "u_bounds", "du_bounds", "linear", "horizon"):
-        assert getattr(new, name) is getattr(old, name)
+        np.testing.assert_equal(getattr(new, name), getattr(old, name))
 
 
 @pytest.mark.parametrize("model", [WRONG, RIGHT])
