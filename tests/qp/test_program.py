@@ -151,3 +151,24 @@ def test_a_solution_is_shown_by_its_outcome():
     assert outcome == "    solved 4 of 5, 1 INVALID_DATA,"
     value = known.value[[0, 1, 3, 4]]
     assert values.startswith(f"    value from {value.min():.4g} to {value.max():.4g}, residual up")
+
+
+@pytest.mark.parametrize("lead", [(), (3,)])
+def test_absent_parts_are_none(lead):
+    H, q, one = torch.eye(2).double(), torch.ones(*lead, 2).double(), torch.ones(2).double()
+    G = torch.tensor([[1.0, 1.0]]).double()
+    cases = [
+        (QuadraticProgram(H, q), [-1.0, -1.0], 0),
+        (QuadraticProgram(H, q, lb=-0.5 * one), [-0.5, -0.5], 2),
+        (QuadraticProgram(H, q, ub=-2 * one.expand(*lead, 2)), [-2.0, -2.0], 2),
+        (QuadraticProgram(H, q, G=G, lb=one[:1]), [0.5, 0.5], 1),
+        (QuadraticProgram(H, q, C=G, b=2 * one[:1]), [1.0, 1.0], 0),
+    ]
+    for qp, z, n_g in cases:
+        assert qp.w.shape == (n_g,)
+        solution = solve_qp(qp)
+        assert_close(solution.z, torch.tensor(z).double().expand(*lead, 2), rtol=0, atol=1e-6)
+    with pytest.raises(QPError, match=r"b: got shape \(0,\), .* with n_c = 1 as in C"):
+        QuadraticProgram(H, q, C=G)
+    with pytest.raises(QPError, match="H: got NoneType, expected a floating-point torch.Tensor"):
+        QuadraticProgram(None, q)  # pyright: ignore[reportArgumentType]

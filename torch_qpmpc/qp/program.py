@@ -18,6 +18,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -100,12 +101,17 @@ def batch_shape(tensors: Sequence[Tensor]) -> torch.Size:
     return broadcast(*(x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True)))
 
 
+#: The default of a part that a QP need not have.
+ABSENT: Any = None
+
+
 @dataclass(frozen=True, repr=False)
 class QuadraticProgram:
     """A validated batch of parametric QPs (eq:qp2).
 
     Every tensor may have leading batch dimensions; they broadcast against each other. A tensor
-    without them is shared by the whole batch, and its gradient is summed over it.
+    without them is shared by the whole batch, and its gradient is summed over it. None stands for
+    what a QP has not: no constant, equations, rows or bounds.
 
     Args:
         H: cost matrix, ``(*batch, n_z, n_z)``, symmetric positive semidefinite.
@@ -113,11 +119,12 @@ class QuadraticProgram:
         c: constant cost, ``(*batch,)``.
         C: equality matrix, ``(*batch, n_c, n_z)``.
         b: equality right-hand side, ``(*batch, n_c)``.
-        G: inequality matrix, ``(*batch, n_g, n_z)``.
+        G: inequality matrix, ``(*batch, n_g, n_z)``; the identity if only bounds are given.
         lb: lower bounds, ``(*batch, n_g)``; ``-inf``, or -1e20 and less, where there is none.
         ub: upper bounds, ``(*batch, n_g)``; ``inf``, or 1e20 and more, where there is none.
             Smaller bounds count, and cost no accuracy where they are far from the solution.
-        w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf`` is a hard row.
+        w: weights of the l1 relaxation, ``(*batch, n_g)``, non-negative; ``inf``, as by
+            default, is a hard row.
         check_values: also check the values (finite, H symmetric and positive semidefinite,
             lb <= ub, w >= 0). `QPMPC` passes ``False``: its parametrisations guarantee them, and
             the solve detects values that training has made invalid.
@@ -129,35 +136,25 @@ class QuadraticProgram:
 
     Example:
         >>> import torch, torch_qpmpc as qm
-        >>> one = torch.ones(1)
-        >>> qp = qm.QuadraticProgram(
-        ...     H=torch.eye(1),
-        ...     q=-2 * one,
-        ...     c=torch.zeros(()),
-        ...     C=torch.zeros(0, 1),
-        ...     b=torch.zeros(0),
-        ...     G=torch.eye(1),
-        ...     lb=-one,
-        ...     ub=one,
-        ...     w=torch.inf * one,
-        ... )
+        >>> qp = qm.QuadraticProgram(torch.eye(2), torch.tensor([-2.0, 0.5]), ub=torch.ones(2))
         >>> qm.solve_qp(qp).z
-        tensor([1.])
+        tensor([ 1.0000, -0.5000])
     """
 
     H: Tensor
     q: Tensor
-    c: Tensor
-    C: Tensor
-    b: Tensor
-    G: Tensor
-    lb: Tensor
-    ub: Tensor
-    w: Tensor
+    c: Tensor = ABSENT
+    C: Tensor = ABSENT
+    b: Tensor = ABSENT
+    G: Tensor = ABSENT
+    lb: Tensor = ABSENT
+    ub: Tensor = ABSENT
+    w: Tensor = ABSENT
     check_values: InitVar[bool] = True
     n_known: InitVar[int] = dataclasses.field(default=0, kw_only=True)
 
     def __post_init__(self, check_values: bool, n_known: int) -> None:
+        self._fill()
         self._check_events()
         try:
             _ = self.batch_shape
@@ -189,6 +186,20 @@ class QuadraticProgram:
     def tensors(self) -> tuple[Tensor, ...]:
         """Return H, q, c, C, b, G, lb, ub, w."""
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
+
+    def _fill(self) -> None:
+        """Put what a QP without them has in place of absent parts."""
+        given = dict(zip(EVENT_SHAPES, self.tensors(), strict=True))
+        if all(x is not None for x in given.values()) or not isinstance(self.H, Tensor):
+            return
+        one, bound = self.H.new_ones(self.H.shape[-1:]), self.lb if self.ub is None else self.ub
+        G = one.diag()[: 0 if bound is None else None] if self.G is None else self.G
+        row = one.new_full(G.shape[-2:-1], torch.inf)
+        none = {"c": one.new_zeros(()), "C": one.diag()[:0], "b": one[:0], "G": G}
+        none |= {"lb": -row, "ub": row, "w": row}
+        for name in none:
+            if given[name] is None:
+                object.__setattr__(self, name, none[name])
 
     def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):
