@@ -20,6 +20,7 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPError
+from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import (
@@ -329,6 +330,16 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
     assert run.observer is not None
     assert plant.n_x == run.policy.n_x == run.summary["order"] == len(run.observer.A) >= 2
     assert run.summary["J_start"] < 25, "16 with both states known, 37 by feedback of the position"
+    assert "constraint=mpc" in repr(run)
+    for seed in (5, 6):  # run.predict holds the filter
+        loop, env = gymnasium_loop(run.policy.policy, plant, starts=1, seed=seed), plant.make()
+        (y, _), costs = env.reset(seed=seed), []
+        for k in range(len(loop.costs)):
+            y, reward, *_ = env.step(run.predict(y, begins=k == 0))
+            costs.append(-float(reward))
+        assert costs == pytest.approx(loop.costs[:, 0].tolist(), rel=1e-6, abs=1e-9)
+    with pytest.raises(QPError, match=r"observation: got shape \(4,\), expected shape"):
+        run.predict(np.zeros(4))
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
     assert (cut / STARTS).read_bytes() == (whole / STARTS).read_bytes()
     (cut / STARTS).rename(tmp_path / STARTS)

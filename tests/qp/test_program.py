@@ -170,5 +170,5 @@ def test_absent_parts_are_none(lead):
         assert_close(solution.z, torch.tensor(z).double().expand(*lead, 2), rtol=0, atol=1e-6)
     with pytest.raises(QPError, match=r"b: got shape \(0,\), .* with n_c = 1 as in C"):
         QuadraticProgram(H, q, C=G)
-    with pytest.raises(QPError, match="H: got NoneType, expected a floating-point torch.Tensor"):
+    with pytest.raises(QPError, match=r"H: got NoneType, expected a floating-point torch\.Tensor"):
         QuadraticProgram(None, q)  # pyright: ignore[reportArgumentType]

@@ -187,8 +187,7 @@ class QuadraticProgram:
         """Return H, q, c, C, b, G, lb, ub, w."""
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
-    def _fill(self) -> None:
-        """Put what a QP without them has in place of absent parts."""
+    def _fill(self) -> None:  # parts that are absent
         given = dict(zip(EVENT_SHAPES, self.tensors(), strict=True))
         if all(x is not None for x in given.values()) or not isinstance(self.H, Tensor):
             return
@@ -197,9 +196,8 @@ class QuadraticProgram:
         row = one.new_full(G.shape[-2:-1], torch.inf)
         none = {"c": one.new_zeros(()), "C": one.diag()[:0], "b": one[:0], "G": G}
         none |= {"lb": -row, "ub": row, "w": row}
-        for name in none:
-            if given[name] is None:
-                object.__setattr__(self, name, none[name])
+        for name in (x for x in none if given[x] is None):
+            object.__setattr__(self, name, none[name])
 
     def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):

@@ -24,7 +24,8 @@ from torch_qpmpc.analysis.structure import (
     predictions,
     second_moment,
 )
-from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.checks import check_tensor
+from torch_qpmpc.envs import KalmanFilter, LinearSystem
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import check_config, load_config, settings
 from torch_qpmpc.experiment.run_folder import NUMBERS, learned_qp, read_metrics, read_summary
@@ -48,6 +49,43 @@ class FinishedRun:
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
+        self._last: tuple[Any, ...] = ()
+
+    def __repr__(self) -> str:
+        """Say which run it is, and its mean costs before and after learning."""
+        cfg, J = self.cfg, self.summary
+        case = f"task={cfg.task.name} constraint={cfg.constraint.name} seed={cfg.seed}"
+        return f"<run {self.folder}: {case}, J {J['J_start']:.4g} to {J['J_best']:.4g}>"
+
+    def predict(self, observation: Any, begins: bool = False) -> np.ndarray:
+        """Return the learned policy's action ``(*batch, n_u)`` for the next observation.
+
+        A run that started from a log acts on the estimate of its `observer`, which remembers the
+        observations and actions before.
+
+        Args:
+            observation: ``(*batch, n)`` of episodes side by side: the output, after the known
+                signals if there are some.
+            begins: True for the first observation of an episode; the first call begins one, too.
+
+        Raises:
+            QPError: the observation has another shape.
+        """
+        if self.observer is None:
+            return self.policy.predict(observation)
+        split, model = self.policy.n_p - self.policy.n_x, self.observer
+        p = torch.as_tensor(np.asarray(observation, float))
+        d, y = check_tensor("observation", p, split + len(model.C)).tensor_split([split], -1)
+        kalman, k = KalmanFilter(model), 0
+        if begins or not self._last:
+            x = kalman.first(y)
+        else:
+            *last, k = self._last
+            k += 1
+            x = kalman.following(*last, y, k)
+        u = torch.as_tensor(self.policy.predict(torch.cat((d, x), -1)))
+        self._last = x, u, d[..., : model.E.shape[-1]], k
+        return u.numpy()
 
     @cached_property
     def cfg(self) -> DictConfig:
