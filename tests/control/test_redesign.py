@@ -81,7 +81,7 @@ def test_what_a_redesign_does_not_name_stays(argument):
 def test_every_argument_is_redesigned_or_refused():
     arguments = {**inspect.signature(qm.LinearMPC).parameters}
     arguments |= {**inspect.signature(qm.Controller).parameters}
-    for name in arguments.keys() - CHANGES.keys():
+    for name in arguments.keys() - CHANGES.keys() - {"violation"}:  # see test_violation.py
         with pytest.raises(TypeError, match=f"redesign got an unexpected keyword argument '{name}"):
             made().redesign(**{name: None})
 

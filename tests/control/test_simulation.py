@@ -89,6 +89,8 @@ def test_the_cost_is_that_of_its_formula():
     u_s = 0.2 * run.r[:-1]
     cost = (run.y - run.r)[:-1] ** 2 + 0.2 * (run.u - u_s) ** 2 + 0.1 * du**2
     assert np.allclose(run.cost, (cost + run.known * run.u)[:, 0], atol=1e-6)
+    other = controller.simulate(([[0.8]], [[0.6]]), 3, r=[1.0], known=known)
+    assert np.array_equal(other.known, run.known[:3]), "of a plant without known signals"
 
 
 def test_violations_cost_their_price():

@@ -221,9 +221,9 @@ class Controller:
 
         Args:
             changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
-                ``du_bounds``, ``y_slack`` and ``u_target`` of `LinearMPC`, and ``noise`` and
-                ``drift``. A mapping changes the signals that it names; None in it removes a bound
-                or a weight, or asks for the default of another argument.
+                ``du_bounds``, ``y_slack``, ``u_target`` and ``violation`` of `LinearMPC`, ``noise``
+                and ``drift``. A mapping changes the signals that it names; None in it removes a
+                bound or a weight, or asks for the default of another argument.
 
         Raises:
             QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
@@ -297,8 +297,7 @@ class Controller:
         The loops must show that the design's own cost, `Run.costs`, falls by 1 %. Then the
         controller starts again with the new model, from rest with its last input. Loops start where
         the last `reset` rests; with a log's model, at rest in the middle of the set-points; with an
-        environment, where its own reset says: without a log the filter takes a start that is not at
-        rest for a disturbance, until it has settled.
+        environment, where its own reset says.
 
         Args:
             source: an environment, as in `simulate`: the controller gathers transitions in closed
@@ -398,11 +397,9 @@ class Controller:
             folder: the folder of the files, created if it does not exist.
             name: the beginning of the names in C.
             options: ``dtype``, ``max_iterations`` and ``storage`` of `export_c`. ``missing``: True
-                for a plant whose outputs are often missing: after a missing output the C code
-                carries the covariance of the estimates, as `step` does, until it is steady again:
-                n_e^2 more numbers of state for n_e states and disturbances, tables of twice as
-                many, and about 4 n_e^3 operations in such a step. Otherwise the steady gains stay,
-                which is right for single missing outputs.
+                for a plant whose outputs are often missing: the C code then carries the covariance
+                of the n_e estimates, as `step` does: n_e^2 more numbers of state, tables of twice
+                as many, about 4 n_e^3 operations. Otherwise the steady gains stay.
 
         Returns:
             Sizes and the measured agreement.

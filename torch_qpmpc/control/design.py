@@ -19,6 +19,9 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import DEFAULTS, check_used, read_levels
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
+#: A response above this share of those soon after decides whether an output keeps its bound.
+DECIDES = 0.25
+Sides = tuple[Array, Array]
 REFERENCES = ("held", "preview")
 #: The default price of a violation by an output's size, relative to a typical stage's cost.
 Y_SLACK = 1e3
@@ -45,6 +48,7 @@ class Design:
         limits: known signals that bound an output or input from below and above, by its name, ""
             on a side without one.
         u_target: what inputs rest near, by name; see `resting`.
+        violation: the share of steps in which outputs may leave a bound, by name; see `margins`.
 
     Raises:
         QPError: a number is invalid, or nothing has a cost.
@@ -68,6 +72,7 @@ class Design:
     levels: dict[str, tuple[float, ...]] = field(default_factory=dict)
     switching: dict[str, Any] = field(default_factory=dict)
     u_target: dict[str, float] = field(default_factory=dict)
+    violation: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_choice("references", self.references, REFERENCES)
@@ -83,6 +88,9 @@ class Design:
         object.__setattr__(self, "y_slack", prices)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
+        if (self.y_bounds[0] + self.margins[0] > self.y_bounds[1] - self.margins[1]).any():
+            got = f"{self.violation}, which leaves no room between the bounds"
+            raise QPError.expected("violation", got, "larger shares, or wider y_bounds")
         if (self.y_slack < 0).any():
             got = f"{self.y_slack.tolist()}"
             raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
@@ -101,11 +109,12 @@ class Design:
 
         Weights of two signals stay with both; None removes a bound or all weights of a signal.
         """
-        names = self.plant.outputs if name in ("Q", "y_bounds", "y_slack") else self.plant.inputs
+        of_y = name in ("Q", "y_bounds", "y_slack", "violation")
+        names = self.plant.outputs if of_y else self.plant.inputs
         if unknown := sorted({*changes} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         old = getattr(self, name)
-        if name == "u_target":
+        if name in ("u_target", "violation"):
             return {**old, **changes}
         if name == "y_slack":
             return {**dict(zip(names, old.tolist(), strict=True)), **changes}
@@ -185,6 +194,7 @@ class Design:
             plant=self.scaling.plant(self.plant),
             levels={},
             u_target={},
+            violation={},
             Q=self.Q * np.outer(y, y),
             R=self.R * np.outer(u, u),
             dR=self.dR * np.outer(u, u),
@@ -255,14 +265,59 @@ class Design:
             nominal[of[of >= 0]] = np.stack(ends)[of >= 0]
         return nominal
 
-    def bounds_at(self, known: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Return the bounds of outputs and inputs where the known signals ``(*batch, n_d)`` are."""
+    def answers(self, shows: float) -> Array:
+        """Return the first step in which an input moves each output its final way, ``(n_y,)``.
+
+        Smaller responses than a part ``shows`` of the largest of the next ten steps do not.
+        """
+        plant, x, steps = self.plant, self.plant.B * self.scaling.u, []
+        for _ in range(max(10 * self.horizon, 200)):
+            steps.append(plant.C @ x)
+            x = plant.A @ x
+        sign, moves = np.sign(np.cumsum(steps, 0))[:-9], np.abs(steps)
+        ahead = np.lib.stride_tricks.sliding_window_view(moves.max(2), 10, axis=0).max(-1)
+        away = np.logical_and.accumulate(moves[:-9] <= shows * ahead[..., None])
+        if np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9:
+            away |= sign != sign[-1]
+        away = np.pad(away, ((1, 0), (0, 0), (0, 0)), constant_values=True)
+        return (len(away) - away[::-1].argmax(0)).min(-1)
+
+    @cached_property
+    def margins(self) -> Array:
+        """How far plans stay from the lower and upper bounds of outputs, ``(2, n_y)``.
+
+        With `violation` it is the quantile of the log's errors of predictions for the step that
+        `answers`, which the next input decides. The next error exceeds it with at most that chance,
+        whatever its distribution, if it is as likely as any of the log's to be the largest (Lei et
+        al., "Distribution-free predictive inference for regression", JASA 113, 2018).
+        """
+        margins, errors = np.zeros((2, len(self.Q))), self.plant.errors
+        for name, share in self.violation.items():
+            i, got = self.plant.outputs.index(name), f"{share:g} of {name}"
+            if not 0 < share < 1 or not self.bounded[0][i]:
+                raise QPError.expected("violation", got, "a share in (0, 1), of a bounded output")
+            k = int(self.answers(DECIDES)[i])
+            e = np.zeros(0) if errors is None else np.sort(errors[:, k - 1 : k, i], axis=None)
+            e = e[np.isfinite(e)]
+            if (place := int(np.ceil((len(e) + 1) * (1 - share)))) > len(e):
+                got = f"{got}, and {len(e)} errors of the log's predictions {k} steps ahead"
+                remedy = f"Pass a model of qm.identify(.., horizon={k}), or a longer log."
+                raise QPError.expected("violation", got, f"{1 / share - 1:.0f} errors", remedy)
+            margins[:, i] = np.maximum([-e[-place], e[place - 1]], 0.0)
+        return margins
+
+    def bounds_at(self, known: Array, kept: bool = False) -> tuple[Sides, Sides]:
+        """Return the bounds of outputs and inputs where the known signals ``(*batch, n_d)`` are.
+
+        Those of outputs that plans have ``kept`` are `margins` away.
+        """
         known = np.insert(known, 0, np.nan, axis=-1)
         y, u = (
             np.where(of >= 0, known[..., of + 1], bounds)
             for of, bounds in zip(self.limited, (self.y_bounds, self.u_bounds), strict=True)
         )
-        return (y[..., 0, :], y[..., 1, :]), (u[..., 0, :], u[..., 1, :])
+        low, high = kept * self.margins
+        return (y[..., 0, :] + low, y[..., 1, :] - high), (u[..., 0, :], u[..., 1, :])
 
     def costs(
         self, y: Tensor, r: Tensor, u: Tensor, u_s: Tensor, du: Tensor, known: Tensor
@@ -280,13 +335,10 @@ class Design:
         return cost + (prices * outside).sum(-1)
 
     def arranged(self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any) -> Any:
-        """Return `LinearMPC.arrange`, for signals of one batch shape in torch's or numpy's arrays.
+        """Return `LinearMPC.arrange`, for signals of one batch shape in ``torch`` or ``np`` arrays.
 
-        Args:
-            arrays: ``torch`` or ``np``.
-            x, u_last: ``(*batch, n)`` and ``(*batch, m)``.
-            target: the parts of a `Target`, with a dimension for the stages if it is `staged`.
-            known: ``(*batch, N + 1, n_d)``.
+        They are ``(*batch, n)``, the parts of a `Target`, with a dimension for the stages if it is
+        `staged`, ``(*batch, m)`` and ``(*batch, N + 1, n_d)``.
         """
         signals = self.acts, self.nominal, self.weighted, *self.bounded_places
         acts, nominal, of_r, of_y, of_u = map(arrays.asarray, signals)
@@ -350,9 +402,7 @@ class Design:
     def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
         """Return rows D with lower and upper bounds, and the place of the signal of each.
 
-        Args:
-            kind: 0 for outputs, 1 for inputs.
-            S, K: the maps to the outputs or inputs and to the known signals.
+        The maps S to the outputs (of ``kind`` 0) or inputs (1) and K to known signals make them.
         """
         bounds, of = (self.y_bounds, self.u_bounds)[kind], self.limited[kind]
         fixed, (side, i) = np.flatnonzero(np.isfinite(bounds).any(0)), np.nonzero(of >= 0)
@@ -361,7 +411,10 @@ class Design:
             np.append(part[fixed], np.where(side == k, self.nominal[j], limit))
             for k, (part, limit) in enumerate(zip(bounds, (-np.inf, np.inf), strict=True))
         )
-        return np.vstack((S[fixed], S[i] - K[j])), lower, upper, np.append(fixed, i)
+        places = np.append(fixed, i)
+        if kind == 0:
+            lower, upper = lower + self.margins[0, places], upper - self.margins[1, places]
+        return np.vstack((S[fixed], S[i] - K[j])), lower, upper, places
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -514,6 +567,12 @@ def read_wished(name: str, value: Any, names: Sequence[str]) -> Array:
     numbers = read_vector(name, value, names, 0.0)
     by_default = isinstance(value, Mapping) and [key not in value for key in names]
     return np.where(by_default, np.nan, numbers)
+
+
+def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
+    """Read the numbers that are given by name."""
+    pairs = zip(names, read_wished(name, value, names).tolist(), strict=True)
+    return {key: x for key, x in pairs if not np.isnan(x)}
 
 
 def read_moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:

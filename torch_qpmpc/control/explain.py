@@ -120,7 +120,7 @@ def _limits(design: Design, lam: Array, y: Array, u: Array, known: Array) -> tup
     prices = np.append(lam[len(lam) - N * width - n_y :], np.zeros(width - n_y))
     prices = prices.reshape(N + 1, width)  # the last stage has rows of outputs alone
     prices[0, :n_y] = 0.0  # nothing moves the outputs of this step
-    bands, bounds = design.bounds_at(known[: N + 1])
+    bands, bounds = design.bounds_at(known[: N + 1], True)
     u, of_input = np.vstack((u, u[-1:])), design.scaling.u
     kinds = (
         ("", plant.outputs, y, bands, design.usual, of_y),

@@ -43,12 +43,11 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
-        plan, target: the reports of the plan's and the target's QPs.
-        free: the report of the QP of inputs that the target leaves free, None without one.
-        table_bytes: the size of all constant tables, without self-tests.
-        state_bytes: the size of the state, None without a compiler.
-        steps: the number of steps of the closed loop that is compared.
-        difference: the largest difference of an input; None without a compiler.
+        plan, target, free: the reports of the QPs; free inputs have one or None.
+        table_bytes, state_bytes: the sizes of all constant tables, without self-tests, and of the
+            state, None without a compiler.
+        steps, difference: the length of the closed loop that is compared, and the largest
+            difference of an input; None without a compiler.
         missing: the covariance of the estimates is carried where outputs are missing.
     """
 
@@ -78,10 +77,7 @@ class ControllerExport:
 
 
 class Loop(NamedTuple):
-    """Signals of a closed loop by step: y, r and known with their stages, and u.
-
-    It starts at rest with the input ``start``, which is one row.
-    """
+    """Signals of a closed loop by step, from rest with the input ``start``, which is one row."""
 
     y: Array
     r: Array

@@ -122,11 +122,8 @@ class Move(NamedTuple):
 class Law:
     """A linear MPC with an observer; see `torch_qpmpc.control.controller.Controller`.
 
-    Attributes:
-        mpc: the MPC.
-        noise, drift: standard deviations, ``(n_y,)`` and ``(n_w,)``.
-        observer: the observer.
-        max_plausible: the largest sizes of outputs and set-points, and of known signals.
+    ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard deviations, and ``max_plausible`` the
+    largest sizes of outputs and set-points, and of known signals.
     """
 
     mpc: LinearMPC
@@ -376,11 +373,7 @@ class Law:
     def read_known(
         self, known: Any, rows: int, least: int | None = None, sane: bool = True
     ) -> Array:
-        """Return known signals ``(rows, n_d)``, from one row or at least ``least``, by default all.
-
-        Raises:
-            QPError: they are missing, or invalid; see `read`.
-        """
+        """`read` known signals from one row or at least ``least``, by default all."""
         names = self.design.plant.known
         if not names and known is None:
             return np.zeros((rows, 0))
@@ -391,12 +384,9 @@ class Law:
         return self.read("known", known, rows, rows if least is None else least, sane)
 
     def read_set_points(self, r: Any, rows: int, last: Array, sane: bool = True) -> Array:
-        """Return set-points ``(rows, n_y)``, by default the ``last`` ones.
+        """`read` set-points, by default the ``last`` ones.
 
         Of outputs without a weight, which need none, they are zero if left out or implausible.
-
-        Raises:
-            QPError: they are None in the first step, or invalid; see `read`.
         """
         outputs = self.design.plant.outputs
         if r is None and not len(last) and self.design.Q.any():
@@ -412,11 +402,11 @@ class Law:
         return table
 
     def read(self, name: str, value: Any, rows: int, least: int = 1, sane: bool = True) -> Array:
-        """Return rows of y, r or known signals.
+        """Return rows of y, r or known signals, ``(rows, n)``.
 
         Raises:
-            QPError: a name or shape is wrong, or (if they must be ``sane``) a number is not finite
-                or above `max_plausible`.
+            QPError: they are missing, a name or shape is wrong, or (if they must be ``sane``) a
+                number is not finite or above `max_plausible`.
         """
         plant, known = self.design.plant, name == "known"
         names = plant.known if known else plant.outputs

@@ -68,13 +68,10 @@ class LearningReport:
     Attributes:
         accepted: True if the controller has changed.
         before, after: the mean costs of the compared closed loops, with the old and the new model.
-        pairs: their number.
+        pairs, steps, plant: their number, their length, and their plant in words.
         interval: the 95 % confidence interval of the mean difference of their costs, plus the
             hundredth of the old one that is the least gain.
-        steps: the steps of each of them.
-        transitions: the number of transitions that the new model is fitted to.
-        plant: the plant of the closed loops, in words.
-        model: the new model.
+        transitions, model: the new model, and the number of transitions that it is fitted to.
     """
 
     accepted: bool
@@ -123,7 +120,12 @@ def learn(
     check_seed(seed)
     if hasattr(source, "reset"):
         middle = law.read_set_points(r, 1, memory.r)[0]
-        plant = _environment(law.design, source, middle, known, spread, steps)
+        size = _sizes(law.design, spread, SMALL * law.design.usual)
+
+        def options(rng: np.random.Generator) -> dict[str, Any]:
+            return {"known": known, "r": _levels(law.design, middle, size, steps, rng)}
+
+        plant = Plant("the environment", source, options)
         log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
     else:
         log, held_out = _parts(_checked(as_log(source), law.design.plant))
@@ -137,18 +139,6 @@ def learn(
     return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 
-def _environment(
-    design: Design, env: Any, middle: Array, known: Any, spread: Any, steps: int
-) -> Plant:
-    """Return loops with an environment, with set-points about the middle."""
-    size = _sizes(design, spread, SMALL * design.usual)
-
-    def options(rng: np.random.Generator) -> dict[str, Any]:
-        return {"known": known, "r": _levels(design, middle, size, steps, rng)}
-
-    return Plant("the environment", env, options)
-
-
 def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
     identified = _identified(held_out, design.plant)
@@ -156,7 +146,7 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
     middle, size = _set_points(design, held_out, middle, spread)
     noise = np.sqrt(np.diag(identified.model.S))
 
-    model = _state_space(identified, design)
+    model = read_model(identified, prices=design.linear.values())
     n, m, n_y, _ = model.sizes
     sizes = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
     own, of_v = sizes.plant(model), np.concatenate((sizes.x, sizes.u))
@@ -244,17 +234,13 @@ def _identified(log: Log, plant: StateSpace) -> Identified:
         if acts and column.std() <= STILL * column.abs().max():
             remedy = "Its effect cannot be learned: pass rows in which it varies."
             raise QPError.expected("known", f"a constant {name}", "one that varies", remedy)
-    return identify(log, 1, order=len(plant.A))
-
-
-def _state_space(model: Identified, design: Design) -> StateSpace:
-    return read_model(model, prices=design.linear.values())
+    return identify(log, 1 if plant.errors is None else plant.errors.shape[1], order=len(plant.A))
 
 
 def _with_model(law: Law, model: Identified) -> Law:
     """Return the law with another model."""
     old = law.design
-    plant = _state_space(model, old)
+    plant = read_model(model, prices=old.linear.values())
     scaling = replace(old, plant=plant).scaling
     w = choose(plant, "auto" if old.disturbances.names else None, scaling)
     design = replace(old, plant=plant, disturbances=w)

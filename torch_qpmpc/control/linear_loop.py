@@ -28,8 +28,7 @@ class LinearLoop:
     """The loop's matrices.
 
     Attributes:
-        A: ``(n + n_e + m, n + n_e + m)``.
-        B: the factors of [load; bias; r], ``(n + n_e + m, m + 2 n_y)``.
+        A, B: ``(n + n_e + m, n + n_e + m)``, and the factors of [load; bias; r].
         controller: A_c, B_c, C_c and D_c from y to u, with the state [e; u_last].
         plant: A, B and C of the model.
         units: the sizes of the inputs, ``(m,)``.

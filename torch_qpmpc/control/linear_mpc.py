@@ -19,6 +19,7 @@ from torch_qpmpc.control.design import (
     read_limits,
     read_moves,
     read_prices,
+    read_said,
     read_switching,
     read_weight,
     read_wished,
@@ -91,6 +92,8 @@ class LinearMPC:
         blocks: numbers of stages that share one input, ``[1, 1, 2, 4]`` for a horizon of 8, or
             ``[1, 1, 6]`` for a control horizon of 3. Bounds of moves then hold between blocks.
         gamma: the discount.
+        violation: the share of steps in which outputs may leave a bound of theirs, by name: plans
+            stay away from it by what the identified model's held-out predictions err.
         u_target: inputs that the set-points leave free rest near these, weighted by R; by name, a
             number or a vector. By default the means of the model's log, and zero without one.
         u_levels: the levels of inputs that take no others, ``{"q": (0.0, 4.0, 8.0)}``; the lowest
@@ -135,6 +138,7 @@ class LinearMPC:
         du_bounds: Any = None,
         y_slack: Any = None,
         u_target: Any = None,
+        violation: Any = None,
         linear: Mapping[str, str | float] | None = None,
         references: str = "held",
         disturbances: Any = "auto",
@@ -158,7 +162,8 @@ class LinearMPC:
         prices += [*signals_of(y_bounds), *signals_of(u_bounds)]
         plant = read_model(model, E, dt, inputs, outputs, known, prices)
         check_whole("horizon", horizon, 1)
-        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack, "u_target": u_target}
+        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
+        weights |= {"u_target": u_target, "violation": violation}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         wishes = read_wishes(plant, None, **weights, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
@@ -182,15 +187,7 @@ class LinearMPC:
 
     @classmethod
     def of_design(cls, design: Design, **options: Any) -> LinearMPC:
-        """Return the MPC of a design.
-
-        Args:
-            design: the `Design`.
-            options: those of the plan, as the constructor takes them.
-
-        Raises:
-            QPError: an option is invalid.
-        """
+        """Return the MPC of a ``design``, with the plan's ``options``, as the constructor's."""
         mpc = cls.__new__(cls)
         mpc._start(design, options)
         return mpc
@@ -219,14 +216,7 @@ class LinearMPC:
         return f"LinearMPC({self.design}{learned})"
 
     def redesigned(self, **changes: Any) -> LinearMPC:
-        """Return this MPC with other bounds or weights.
-
-        Args:
-            changes: as in `Controller.redesign`.
-
-        Raises:
-            QPError: an argument is invalid, or this MPC learns.
-        """
+        """Return this MPC with other bounds or weights, ``changes`` as `Controller.redesign`'s."""
         if learned := ", ".join(self.plan.learned):
             got, remedy = f"an MPC that learns {learned}", "Change the parameters of its plan."
             raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
@@ -235,13 +225,9 @@ class LinearMPC:
         return LinearMPC.of_design(design, **self.options)
 
     def save(self, path: str | Path) -> None:
-        """Write this MPC with its design to the file ``path``, as `QPMPC.save` does.
+        """Write this MPC with its design to the file ``path``, with the errors of `QPMPC.save`.
 
         `LinearMPC.load` reads it, and `QPMPC.load` its plan's QP alone.
-
-        Raises:
-            QPError: a part has a parametrization that is not QPMPC's own.
-            OSError: writing failed; the old file is unchanged.
         """
         save_file(path, KIND, self.stored())
 
@@ -382,9 +368,8 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
         "y_bounds": lambda name, value: read_bounds(name, value, y),
         "u_bounds": lambda name, value: read_bounds(name, value, u),
         "du_bounds": lambda _, value: read_moves(value, u),
-        "u_target": lambda name, value: {
-            key: x for key, x in zip(u, read_wished(name, value, u).tolist(), strict=True) if x == x
-        },
+        "u_target": lambda name, value: read_said(name, value, u),
+        "violation": lambda name, value: read_said(name, value, y),
     }
     check_keywords("redesign", wishes, [*readers])
     limits = {} if old is None else old.limits

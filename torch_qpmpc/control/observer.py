@@ -104,12 +104,8 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     White noise acts on the change of each disturbance in a step.
 
     The first state is one of the identification's log, with disturbances that move the outputs by
-    `SMALL` of their usual deviations.
-
-    Args:
-        design: the design.
-        noise: standard deviations of the outputs' noise, ``(n_y,)``.
-        drift: standard deviations of the disturbances' changes, ``(n_w,)``.
+    `SMALL` of their usual deviations. ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard
+    deviations of the outputs' noise and of the disturbances' changes.
 
     Raises:
         QPError: the model has a mode that the outputs do not show, or that no input moves.

@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.control.design import Design
+from torch_qpmpc.control.design import DECIDES, Design
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
@@ -91,6 +91,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         cost,
         _terminal(design),
         *([_free_inputs(design)] if design.free.any() else []),
+        *([_violation(design)] if design.violation else []),
         _horizon(design),
         _disturbances(design),
         _hard_rows(mpc, r_last, known),
@@ -160,25 +161,25 @@ def _free_inputs(design: Design) -> Finding:
     return Finding("free inputs", True, f"Set-points leave inputs free, which rest near {rests}.")
 
 
+def _violation(design: Design) -> Finding:
+    """What the log promises of the outputs' bounds."""
+    parts = []
+    for name, share in design.violation.items():
+        i = design.plant.outputs.index(name)
+        low, high = (design.plant.quantity("", x).strip() for x in design.margins[:, i])
+        parts.append(
+            f"{name} leaves each bound in at most {share:.3g} of the steps if errors are like the "
+            f"log's and inputs suffice: plans stay {low} and {high} away, as predictions of step "
+            f"{design.answers(DECIDES)[i]}, the first that an input decides, err by no more."
+        )
+    return Finding("violation", True, " ".join(parts))
+
+
 def _horizon(design: Design) -> Finding:
     """The plan is longer than dead times and inverse responses."""
-    plant, N, numbers, needed = design.plant, design.horizon, {}, 1
-    stable = np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9
-    x, steps = plant.B * design.scaling.u, []
-    for _ in range(max(10 * N, 200)):
-        steps.append(plant.C @ x)
-        x = plant.A @ x
-    responses = np.cumsum(steps, 0)
-    moves = np.abs(steps)  # beside the next ten steps', as a ramp has no largest one
-    ahead = np.lib.stride_tricks.sliding_window_view(moves.max(2), 10, axis=0).max(-1)
-    responses = responses[: len(ahead)]
-    away = np.logical_and.accumulate(moves[: len(ahead)] <= SHOWS * ahead[..., None])
-    if stable:
-        away |= np.sign(responses) != np.sign(responses[-1])
-    for i in np.flatnonzero(np.diag(design.Q)):
-        first = 1 + min(int(np.flatnonzero([True, *x])[-1]) for x in away[:, i].T)
-        numbers[plant.outputs[i]] = first
-        needed = max(needed, first)
+    N, first = design.horizon, design.answers(SHOWS)
+    numbers = {design.plant.outputs[i]: int(first[i]) for i in design.weighted}
+    needed = max(numbers.values(), default=1)
     ok = needed < N or needed == 1
     after = "".join(f", until an input moves {name} {x}" for name, x in numbers.items())
     remedy = f"Take a horizon of {2 * needed} or more." * (not ok)
@@ -277,7 +278,7 @@ class Setting(NamedTuple):
 def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
     """Return whether set-points and bands of outputs are within reach of the inputs' bounds."""
     design, known = setting.mpc.design, setting.known
-    plant, faults, (low, high) = design.plant, [], design.bounds_at(known)[0]
+    plant, faults, (low, high) = design.plant, [], design.bounds_at(known, True)[0]
     lower, upper = (reach := _reach(setting)).T
     acting = np.flatnonzero(plant.E.any(0))
     held = " and ".join(plant.quantity(plant.known[i], known[i]) for i in acting)
@@ -306,7 +307,7 @@ def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
 
 def _limits(design: Design, target: Target, known: Array) -> str:
     """Return what a user can do about the bounds that a target is at."""
-    named, (of_y, of_u) = [], design.bounds_at(known)
+    named, (of_y, of_u) = [], design.bounds_at(known, True)
     for kind, names, bounds, x, size in (
         ("y_bounds", design.plant.outputs, of_y, target.y.numpy(), design.scaling.y),
         ("u_bounds", design.plant.inputs, of_u, target.u.numpy(), design.scaling.u),

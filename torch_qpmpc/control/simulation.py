@@ -15,7 +15,6 @@ from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals
 from torch_qpmpc.control.scaling import FAINT, Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.loops import Step, run_loop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,10 +27,8 @@ class Run:
     Attributes:
         design: the controller's design.
         y, r: measured outputs and set-points, ``(T + 1, n_y)``.
-        u: inputs ``(T, m)``.
-        known: known signals, ``(T, n_d)``.
-        u_s: the inputs that hold the target, ``(T, m)``.
-        u_last: the input before the first step, ``(m,)``.
+        u, u_s: inputs, and those that hold the target, ``(T, m)``.
+        u_last, known: the input before the first step ``(m,)``, and known signals ``(T, n_d)``.
     """
 
     design: Design
@@ -130,11 +127,11 @@ def closed_loop(
         raise QPError.expected("noise", f"{noise.tolist()}", "standard deviations >= 0")
     if not hasattr(plant, "reset"):
         model = design.plant if plant is None else read_model(plant)
-        d = _known(model, design, d)
+        own = _known(model, design, d)
         scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
-        rest = scaling.at_rest(model, u, d[0], memory.rest[0], near)
+        rest = scaling.at_rest(model, u, own[0], memory.rest[0], near)
         states = [f"x{i + 1}" for i in range(len(model.A))]
-        plant = _Model(model, d, rest if x is None else read_vector("x", x, states, 0.0))
+        plant = _Model(model, own, rest if x is None else read_vector("x", x, states, 0.0))
     rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
     if not (isinstance(started, tuple) and len(started) == 2):
         remedy = "Its reset returns the outputs and a dict."
@@ -145,28 +142,16 @@ def closed_loop(
         want = f"the outputs alone, {', '.join(design.plant.outputs)}"
         remedy = "Wrap the environment: gymnasium.wrappers.TransformObservation chooses entries."
         raise QPError.expected("plant", got, want, remedy)
-    k, signals = 0, Signals(observed, set_points, d)
-
-    def measured() -> Array:
-        return observed + noise * rng.normal(size=len(noise))
-
-    def policy(y: Array) -> Any:
-        nonlocal signals
+    y = observed + noise * rng.normal(size=len(noise))
+    for k in range(steps):
         ahead = law.read_known(info.get("known"), rows) if announced else d[k : k + rows]
         signals = Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead)
         move = act(signals)
         if move.status not in PLANNED:
             remedy = "Widen the hard bounds, or give the outputs a y_slack."
             raise SolverError(f"Step {k} of the loop has no plan: {move.status.name}. {remedy}")
-        return move
-
-    def step(move: Any) -> Step:
-        nonlocal observed, info, k
         observed, *_, info = plant.step(move.u + load)
-        k += 1
-        return Step(measured(), move)
-
-    for y, move, _ in run_loop(policy, measured(), step, steps):
+        y = observed + noise * rng.normal(size=len(noise))
         yield signals, move, y
 
 

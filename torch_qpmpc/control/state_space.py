@@ -17,6 +17,8 @@ from torch_qpmpc.identification.subspace import visited
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
 Array = np.ndarray
+#: The most rows of errors that a model keeps.
+MOST_ERRORS = 2000
 WANTED = "(A, B), (A, B, C_y), a control.StateSpace, scipy's dlti, or an identification"
 
 
@@ -34,6 +36,7 @@ class StateSpace:
         noise: L ``(n, n_y)`` and S ``(n_y, n_y)`` of an identification, see `Innovations`.
         visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
         means: the means of its inputs and known signals, by name.
+        errors: its errors of held-out predictions 1, .., N steps ahead, ``(rows, N, n_y)``.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -52,6 +55,7 @@ class StateSpace:
     noise: tuple[Array, Array] | None = None
     visited: tuple[Array, Array] | None = None
     means: Mapping[str, float] = field(default_factory=dict)
+    errors: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -113,11 +117,12 @@ def read_model(
         own = {"E": E, "dt": dt, "inputs": inputs, "outputs": outputs, "known": known or None}
         _check_absent("a StateSpace has its own", **own)
         return model
-    offset, units, noise, states, means = None, {}, None, None, {}
+    offset, units, noise, states, means, errors = None, {}, None, None, {}, None
     if isinstance(model, Identified):
         _check_absent("the identification has its own", E=E)
         A, B, E, offset, C, L, S, *_ = model.model
         noise, states = (L, S), visited(model.model, model.log.trajectories)
+        errors = model.errors.numpy()[:: len(model.errors) // MOST_ERRORS + 1].copy()
         log, dt = model.log, _own_dt(dt, model.log.dt)
         units, signals = dict(log.units), (*log.inputs, *log.known)
         rows = torch.cat([torch.hstack((x.u, x.d)) for x in log.trajectories])
@@ -155,7 +160,7 @@ def read_model(
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
-    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states, means)
+    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states, means, errors)
 
 
 def _check_absent(why: str, **arguments: Any) -> None:

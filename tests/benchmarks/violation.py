@@ -1,0 +1,97 @@
+"""Bounds that outputs may leave in a share of the steps, beside plans up to the bounds.
+
+``python -m tests.benchmarks.violation`` identifies a heated tank from logs of 600 steps of each
+kind of noise, and holds a set-point beyond the upper bound for 300 steps of new noise. ``--write``
+puts the table into docs/results/conventions.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import torch_qpmpc as qm
+
+KINDS = ("normal", "heavy-tailed", "coloured")
+SHARES = (None, 0.2, 0.05, 0.01)
+HORIZON, SETTLED, BOUND, BEYOND = 12, 50, 6.0, 7.0
+PAGE = Path(__file__).parents[2] / "docs/results/conventions.md"
+A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.2]]), np.array([[1.0, 0.0]])
+
+
+def noise(kind: str, rng: np.random.Generator, steps: int) -> np.ndarray:
+    """Draw noise of deviation one: normal, of Student's t with 3 degrees of freedom, or AR(1)."""
+    if kind == "heavy-tailed":
+        return rng.standard_t(3, size=steps) / np.sqrt(3)
+    e = rng.normal(size=steps)
+    for k in range(1, steps if kind == "coloured" else 0):
+        e[k] = 0.8 * e[k - 1] + 0.6 * e[k]
+    return e
+
+
+def identified(kind: str, seed: int, steps: int = 600) -> qm.Identified:
+    """Return the model of a log of the tank."""
+    rng = np.random.default_rng([seed, 1])
+    w, v = noise(kind, rng, steps), 0.02 * rng.normal(size=steps)
+    q, x, T = rng.uniform(0, 10, steps // 10).repeat(10), np.array([5.0, 5.0]), np.zeros(steps)
+    for k in range(steps):
+        T[k] = x[0] + v[k]
+        x = A @ x + B[:, 0] * q[k] + [0.15 * w[k], 0.0]
+    return qm.identify(qm.read_log({"T": T, "q": q}, outputs=["T"], inputs=["q"]), HORIZON)
+
+
+def rate(controller: qm.Controller, kind: str, seed: int, steps: int) -> tuple[float, float]:
+    """Return the share of steps above the bound and the mean cost (y - r)^2, on new noise."""
+    rng = np.random.default_rng([seed, 2])
+    w, v = noise(kind, rng, steps + SETTLED), 0.02 * rng.normal(size=steps + SETTLED)
+    x, T = np.array([5.0, 5.0]), np.zeros(steps + SETTLED)
+    controller.reset(y=[5.0], u=[5.0])
+    for k in range(len(T)):
+        T[k] = x[0] + v[k]
+        x = A @ x + B @ controller.step(T[k : k + 1], [BEYOND]) + [0.15 * w[k], 0.0]
+    T = T[SETTLED:]
+    return float((T > BOUND).mean()), float(((T - BEYOND) ** 2).mean())
+
+
+def table(seeds: int, steps: int) -> str:
+    """Return the table: the rate in % with its 95 % interval over the seeds, and the cost."""
+    asked = [f"{share:.0%} asked" for share in SHARES[1:]]
+    rows = [
+        f"| noise | {' | '.join(['none asked', *asked])} |",
+        "| --- |" + " ---: |" * len(SHARES),
+    ]
+    bounds = {"y_bounds": (0.0, BOUND), "u_bounds": (0.0, 10.0)}
+    for kind in KINDS:
+        runs = np.zeros((seeds, len(SHARES), 2))
+        for seed in range(seeds):
+            model = identified(kind, seed)
+            for i, share in enumerate(SHARES):
+                mpc = qm.LinearMPC(model, HORIZON, Q=1.0, dR=0.1, **bounds, violation=share)
+                runs[seed, i] = rate(qm.Controller(mpc), kind, seed, steps)
+        wide = 196 * runs[..., 0].std(0) / np.sqrt(max(seeds - 1, 1))
+        pairs = zip(100 * runs[..., 0].mean(0), wide, runs[..., 1].mean(0), strict=True)
+        cells = " | ".join(f"{x:.1f}±{by:.1f}, {cost:.2f}" for x, by, cost in pairs)
+        rows.append(f"| {kind} | {cells} |")
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Print or write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    text = table(options.seeds, options.steps)
+    print(text)
+    if options.write:
+        start, end = "<!-- violation -->", "<!-- /violation -->"
+        before, rest = PAGE.read_text(encoding="utf-8").split(start)
+        after = rest.split(end)[1]
+        PAGE.write_text(f"{before}{start}\n\n{text}\n\n{end}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
