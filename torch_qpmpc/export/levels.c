@@ -109,7 +109,7 @@ static int search(policy_state *s, policy_info *info, real *starts)
         if (cost < limit) {
             hold_between(s, s->first, s->last);
             s->cutoff = limit - cost;
-            if (solve(s, TOLERANCE, &iterations) != POLICY_INFEASIBLE) least = s->cost;
+            if (solve(s, TIGHT, &iterations) != POLICY_INFEASIBLE) least = s->cost;
             info->iterations += iterations;
         }
         if (least + cost < limit && (branch = undecided(s, 0)) < 0) {

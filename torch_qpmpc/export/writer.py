@@ -37,7 +37,7 @@ CONSTANTS = {
         "FEASIBLE": "1e-8",
         "KNOWN_FEASIBLE": "1e-6",
         "GAP": "1e-9",
-        "GAIN": "1e-9",
+        "GAIN": "1e-13",
         "COARSE": "1e-7",
     },
     "float32": {
@@ -51,7 +51,7 @@ CONSTANTS = {
         "FEASIBLE": "1e-4f",
         "KNOWN_FEASIBLE": "1e-5f",
         "GAP": "1e-4f",
-        "GAIN": "1e-5f",
+        "GAIN": "1e-6f",
         "COARSE": "1e-4f",
     },
 }
@@ -216,7 +216,7 @@ def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
     }
     if tables.decisions:
         values = tables.decisions.values.reshape(-1, tables.decisions.values.shape[-1])
-        near = float(CONSTANTS[settings.dtype]["GAIN"].rstrip("f")) * np.ptp(values, axis=-1)
+        near = (1e-9 if settings.dtype == "float64" else 1e-5) * np.ptp(values, axis=-1)
         arrays |= {"LEVEL": values, "ON_LEVEL": near, "START_COST": tables.decisions.levels.starts}
     return arrays
 

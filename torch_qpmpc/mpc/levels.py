@@ -186,7 +186,7 @@ class Levels:
         They are places ``(*batch, m, S)``, the last one below the first if there is none.
         """
         lower, upper = (side[..., self.rows, None] for side in (lb, ub))
-        room = kernel.TOLERANCE * np.abs(values := self.values[:, None])
+        room = kernel.ON_LEVEL * np.abs(values := self.values[:, None])
         inside = (lower - room <= values) & (values <= upper + room)
         inside[..., 1:] &= np.diff(values) > 0
         last = inside.shape[-1] - 1 - inside[..., ::-1].argmax(-1)

@@ -25,11 +25,11 @@ import numpy as np
 from torch_qpmpc.qp.kernels.linalg import compiled
 
 #: Errors of a row that count as rounding, relative to its terms and to the sum of multipliers.
-TOLERANCE, ROUNDING = 1e-10, 4e-15
+TOLERANCE, ROUNDING = 1e-13, 4e-15
 #: A row with a smaller pivot depends on the held ones; smaller entries are rounding.
 DEPENDENT, NOISE = 1e-11, 1e-9
 #: A plan replaces the best one if it costs less by this fraction.
-GAIN = 1e-9
+GAIN = 1e-13
 #: A violation up to this fraction of a row's terms does not prove that there is no plan.
 FEASIBLE = 1e-8
 #: A row is on a level within this fraction of the levels' distance.
