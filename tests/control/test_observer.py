@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 
 import torch_qpmpc as qm
-from tests.control.controllers import exported
+from tests.control.controllers import exported, load
+from torch_qpmpc import QPError
 from torch_qpmpc.control.observer import SETTLED, moving
 from torch_qpmpc.control.state_space import read_model
 
@@ -160,3 +162,45 @@ def test_a_saved_controller_settles_as_if_it_had_not_been_saved(tmp_path):
     for y in ([1.0], [2.0]):
         assert np.array_equal(controller.step(y), again.step(y))
         assert np.array_equal(controller.x, again.x)
+
+
+@pytest.mark.parametrize("form", ["matrix", "function"])
+def test_a_gain_of_one_s_own_places_the_observer_s_poles(form, tmp_path):
+    """Python, C through a gap, and a file; another noise brings the Kalman filter back."""
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 8, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+
+    def placed(F, H):
+        predictor = scipy.signal.place_poles(F.T, H.T, [0.2, 0.3]).gain_matrix.T
+        return np.linalg.solve(F, predictor)
+
+    o = qm.Controller(mpc).observer
+    gain = placed if form == "function" else placed(o.F, o.H)
+    controller = qm.Controller(mpc, gain=gain)
+    o = controller.observer
+    assert np.allclose(sorted(np.linalg.eigvals(o.F - o.F @ o.L @ o.H)), [0.2, 0.3])
+    twin = load(controller.export_c(tmp_path, missing=True).files, controller)
+    controller.save(tmp_path / "own.qpmpc")
+    loaded, y = qm.Controller.load(tmp_path / "own.qpmpc"), 0.0
+    for k in range(40):
+        seen = np.nan if k % 9 == 5 else y
+        u = controller.step([seen], [0.7])
+        assert np.allclose(u, twin.step([seen], [0.7])[0], atol=1e-9)
+        assert np.array_equal(u, loaded.step([seen], [0.7]))
+        y = 0.9 * y + 0.4 * u[0] + 0.1
+    assert abs(y - 0.7) < 1e-6
+    controller.redesign(noise=0.1)
+    assert np.array_equal(controller.observer.L, qm.Controller(mpc, noise=0.1).observer.L)
+
+
+@pytest.mark.parametrize(
+    ("gain", "message"),
+    [
+        ([[0.5]], r"shape \(1, 1\), or NaN, expected finite numbers of \(2, 1\)"),
+        ([[np.nan], [0.0]], r"shape \(2, 1\), or NaN"),
+        ([[-1.0], [0.0]], r"errors of 1.8 times the last step's, expected F - F L H with eigen"),
+    ],
+)
+def test_a_gain_that_no_observer_has_is_refused(gain, message):
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 8, Q=1.0, dR=0.1)
+    with pytest.raises(QPError, match=f"^gain: got {message}"):
+        qm.Controller(mpc, gain=gain)

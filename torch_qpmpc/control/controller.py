@@ -27,7 +27,7 @@ from torch_qpmpc.learning.closed_loop import Improvement
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
 #: The options of a controller that a file holds.
-OPTIONS = ("noise", "drift")
+OPTIONS = ("noise", "drift", "gain")
 
 
 class Controller:
@@ -42,11 +42,13 @@ class Controller:
         mpc: the MPC. Call `reset` when its plan's theta has changed.
         noise: standard deviations of the outputs' noise, as a number, a vector or by name; by
             default the identification's. Without one, a tenth of half the distance between the
-            output's bounds or, without bounds, of the deviation that costs one, ``1 / sqrt(Q)``.
-        drift: standard deviations of each disturbance's change in a step; by default the change
-            that moves an output by its identified noise within the horizon. Without one, a tenth of
-            half the distance between the bounds of the output or the input. A larger ratio of drift
-            to noise rejects disturbances faster and passes on more noise.
+            output's bounds or, without bounds, of ``1 / sqrt(Q)``.
+        drift: standard deviations of each disturbance's change in a step; by default it moves an
+            output by its identified noise within the horizon. Without one, as ``noise``. A larger
+            ratio of drift to noise rejects disturbances faster and passes on more noise.
+        gain: L of an observer of your own, ``(n + n_w, n_y)``, which corrects [x; w] by L times the
+            error of the prediction, or a function of `Observer`'s F and H that returns it. Another
+            model, noise or drift brings the Kalman filter back.
 
     Attributes:
         status: the `Outcome` of the last step, SOLVED before the first.
@@ -77,9 +79,11 @@ class Controller:
         'u1'
     """
 
-    def __init__(self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None) -> None:
+    def __init__(
+        self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None, gain: Any = None
+    ) -> None:
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
-        self._law = ready(Law.of(mpc, noise, drift))
+        self._law = ready(Law.of(mpc, noise, drift, gain))
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
@@ -356,9 +360,8 @@ class Controller:
     def review(self, r: Any = None, known: Any = None) -> Review:
         """Return findings about this design: sentences, and a remedy for each fault.
 
-        They cover the cost, the terminal weight, the horizon, the disturbances, hard bounds that
-        can leave no plan, the reach of set-points, the loop without active bounds (its stability,
-        margin, offset and cost under the log's noise).
+        They cover the cost, the terminal weight, the horizon, the disturbances, hard bounds, the
+        reach of set-points, and the loop without active bounds (its margin, offset and noise).
 
         Args:
             r: set-points that the inputs must reach, by default the last step's.
@@ -407,7 +410,7 @@ class Controller:
         Raises:
             QPError: as in `export_c`, or the self-test fails.
         """
-        return export_controller(self._law.renewed(), self._memory, folder, name=name, **options)
+        return export_controller(self._law.renewed(), self._memory, folder, name, **options)
 
     def export_fmu(
         self, path: str | Path, *, name: str = "policy", **options: Any

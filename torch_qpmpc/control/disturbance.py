@@ -104,7 +104,8 @@ def check_observable(plant: StateSpace) -> None:
     for eigenvalue, mode in unseen_modes(plant.A, plant.C):
         state = int(np.abs(mode).argmax())
         remedy = "Measure a signal that shows it, or remove it from the model."
-        got = f"a mode at {_number(eigenvalue)}, mostly in state {state}, that no output shows"
+        at = f"{eigenvalue if eigenvalue.imag else eigenvalue.real:.3g}"
+        got = f"a mode at {at}, mostly in state {state}, that no output shows"
         raise QPError.expected("model", got, "a detectable model", remedy)
 
 
@@ -180,10 +181,6 @@ def _split(Q: Array, Y: Array) -> tuple[Array, Array]:
     _, sizes, V = np.linalg.svd(rows)
     rank = int((sizes > FLAT).sum())
     return V[:rank].T, V[rank:].T
-
-
-def _number(eigenvalue: complex) -> str:
-    return f"{eigenvalue.real:.3g}" + (f"{eigenvalue.imag:+.3g}j" if eigenvalue.imag else "")
 
 
 @dataclass(frozen=True, eq=False)

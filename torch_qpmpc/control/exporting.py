@@ -64,15 +64,12 @@ class ControllerExport:
     def __str__(self) -> str:
         """Return a report of a few lines."""
         state = "" if self.state_bytes is None else f", state {self.state_bytes:,} bytes"
-        compared = (
-            "not compared: no C compiler was found"
-            if self.difference is None
-            else f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
-        )
+        compared = "not compared: no C compiler was found"
+        if self.difference is not None:
+            compared = f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
         sizes = f"tables {self.table_bytes:,} bytes{state}"
         lines = [", ".join(map(str, self.files)), sizes, compared]
-        if self.missing:
-            lines += ["steps with or after missing outputs carry the covariance of the estimates"]
+        lines += ["steps with or after missing outputs carry the covariance"] * self.missing
         return "\n".join(lines)
 
 
@@ -129,19 +126,11 @@ class CompiledController:
 
 
 def export_controller(
-    law: Law,
-    memory: Memory,
-    folder: str | Path,
-    *,
-    name: str,
-    dtype: str = "float64",
-    max_iterations: int | None = None,
-    storage: str = "fast",
-    missing: bool = False,
+    law: Law, memory: Memory, folder: str | Path, name: str, missing: bool = False, **options: Any
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
     check_name(name)
-    options = {"dtype": dtype, "max_iterations": max_iterations, "storage": storage}
+    dtype = options.get("dtype", "float64")
     mpc, known = law.mpc, last_known(law.design, memory)
     with tempfile.TemporaryDirectory() as temporary:
         parts = {"plan": mpc.plan, "target": mpc.targets, "free": mpc.free}
@@ -186,7 +175,7 @@ def export_controller_fmu(
     """Write a controller as an FMU; see `Controller.export_fmu`."""
     required_compiler()
     with tempfile.TemporaryDirectory() as folder:
-        report = export_controller(law, memory, folder, name=name, missing=True, **options)
+        report = export_controller(law, memory, folder, name, missing=True, **options)
         texts = {file.name: file.read_text(encoding="utf-8") for file in report.files}
     file = write_fmu(path, name, texts, _variables(law, memory), law.design.plant.dt or 1.0)
     return replace(report, files=(file,))

@@ -131,9 +131,10 @@ class Law:
     drift: Array
     observer: Observer
     max_plausible: tuple[Array, Array]
+    gain: Array | None = None
 
     @classmethod
-    def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None) -> Law:
+    def of(cls, mpc: LinearMPC, noise: Any = None, drift: Any = None, gain: Any = None) -> Law:
         """Return the law of an MPC with today's theta.
 
         Raises:
@@ -149,8 +150,9 @@ class Law:
         noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)
         drift = _deviations("drift", drift, drifts, w.names)
         observer = kalman(design, noise, drift)
-        largest = max_plausible(design, noise)
-        return cls(mpc, noise, drift, observer, largest)
+        observer = observer if gain is None else observer.with_gain(gain)
+        own = None if gain is None else observer.L
+        return cls(mpc, noise, drift, observer, max_plausible(design, noise), own)
 
     @property
     def design(self) -> Design:
@@ -321,9 +323,8 @@ class Law:
     def _seen(self, memory: Memory, y: Array, known: Array) -> tuple[Memory, Array | None, Outcome]:
         """Return the memory with the known signals, the estimate corrected by y, and the status.
 
-        While an output is missing, the covariance of the estimates grows, and the gains with it,
-        until they are steady again. Rows of known signals with an implausible entry are not taken;
-        the last ones hold.
+        While an output is missing, the covariance of the estimates grows, and the gains with it.
+        Instead of rows of known signals with an implausible entry the last ones hold.
         """
         seen, valid = self._are_plausible(y, 0), self._are_plausible(known, 1).all()
         memory = memory._replace(known=known[0]) if valid else memory

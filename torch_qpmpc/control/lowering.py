@@ -1,13 +1,11 @@
 """Lower a design onto schemes: the QP of the plan, in deviations from the target, and the target's.
 
 The plan's stages weigh y_k - r_k. Where bounds of inputs keep the target's outputs y_s off r, the
-cost of an endless loop about the target has a slope lam'(x - x_s), and so has the terminal cost:
-
-    lam = gamma A'lam + 2 C'Q (y_s - r).
-
-With it the plan rests at the target whatever its horizon (Zanon and Faulwasser, "Economic MPC
-without terminal constraints: gradient-correcting end penalties enforce asymptotic stability",
-J. Process Control 63, 2018). Of bounds of outputs see `Design.weighed`.
+cost of an endless loop about the target has a slope lam'(x - x_s), and so has the terminal cost,
+with lam = gamma A'lam + 2 C'Q (y_s - r). With it the plan rests at the target whatever its horizon
+(Zanon and Faulwasser, "Economic MPC without terminal constraints: gradient-correcting end penalties
+enforce asymptotic stability", J. Process Control 63, 2018). Of bounds of outputs see
+`Design.weighed`.
 
 The target is the steady state within bounds that is nearest to the set-point:
 

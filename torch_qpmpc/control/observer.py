@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -76,6 +76,21 @@ class Observer(NamedTuple):
         none, mean = np.zeros((len(self.F), 0)), self.start
         return Innovations(self.F, none, none, mean, self.H, self.L, self.S, mean, self.P)
 
+    def with_gain(self, gain: Any) -> Observer:
+        """Return the observer with another L, or with the one that ``gain(F, H)`` returns.
+
+        Raises:
+            QPError: its shape is wrong, or errors of the estimates do not decay with it.
+        """
+        L, shape = np.array(gain(self.F, self.H) if callable(gain) else gain, float), self.L.shape
+        if L.shape != shape or not np.isfinite(L).all():
+            raise QPError.expected("gain", f"shape {L.shape}, or NaN", f"finite numbers of {shape}")
+        radius = np.abs(np.linalg.eigvals(self.F - self.F @ L @ self.H)).max()
+        if radius >= 1 - ON_CIRCLE:
+            got = f"errors of {radius:.4g} times the last step's"
+            raise QPError.expected("gain", got, "F - F L H with eigenvalues within the unit circle")
+        return self._replace(gains=L[None], P=np.zeros_like(self.P))
+
     def spread(self, k: int) -> Array:
         """Return P after k steps with all outputs."""
         if k == len(self.gains) - 1:
@@ -101,11 +116,9 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
 
     The noise of the state and the outputs is that of an identification. Without one, white noise
     acts on each input, with `SMALL` times its half range as standard deviation, and on each output.
-    White noise acts on the change of each disturbance in a step.
-
-    The first state is one of the identification's log, with disturbances that move the outputs by
-    `SMALL` of their usual deviations. ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard
-    deviations of the outputs' noise and of the disturbances' changes.
+    ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard deviations of the outputs' noise and
+    of the disturbances' changes. The first state is one of the identification's log, with
+    disturbances that move the outputs by `SMALL` of their usual deviations.
 
     Raises:
         QPError: the model has a mode that the outputs do not show, or that no input moves.
