@@ -29,15 +29,15 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 413,
+    ".": 415,
     "analysis": 851,
     "control": 4745,
     "envs": 1432,
     "experiment": 2985,
     "export": 1515,
     "learning": 2842,  # models that did not train theta decide in improve
-    "identification": 2425,
-    "mpc": 4117,  # nonlinear MPC, which blended.py is to pay for
+    "identification": 2629,  # learned dynamics, which blended.py is to pay for
+    "mpc": 4109,
     "proofs": 1001,
     "qp": 5877,
     "study": 587,  # load_run(..).predict, which refinement's second start pays for

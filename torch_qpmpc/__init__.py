@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from torch_qpmpc.export.export import CompiledPolicy, export_c
     from torch_qpmpc.export.fmu import export_fmu
     from torch_qpmpc.identification.identification import identify
+    from torch_qpmpc.identification.learned import identify_nonlinear
     from torch_qpmpc.identification.reading import read_log
     from torch_qpmpc.learning.closed_loop import improve
     from torch_qpmpc.learning.gauss_newton import GaussNewton
@@ -60,6 +61,7 @@ __all__ = [
     "export_fmu",
     "identify",
     "identify_blended",
+    "identify_nonlinear",
     "improve",
     "load_run",
     "read_log",
@@ -95,6 +97,7 @@ if not TYPE_CHECKING:
         "export_fmu": "torch_qpmpc.export.fmu:export_fmu",
         "identify": "torch_qpmpc.identification.identification:identify",
         "identify_blended": "torch_qpmpc.mpc.blended:identify_blended",
+        "identify_nonlinear": "torch_qpmpc.identification.learned:identify_nonlinear",
         "improve": "torch_qpmpc.learning.closed_loop:improve",
         "load_run": "torch_qpmpc.study.runs:load_run",
         "read_log": "torch_qpmpc.identification.reading:read_log",

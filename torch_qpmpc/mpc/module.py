@@ -490,13 +490,14 @@ class QPMPC(nn.Module):
         A symbolic link at ``path`` is replaced. Later releases read the file.
 
         Raises:
-            QPError: a part has a parametrization that is not QPMPC's own, or there are dynamics.
+            QPError: a part has a parametrization that is not QPMPC's own, or dynamics are code.
             OSError: writing failed; the old file is unchanged.
         """
         check_own("save", self)
-        if self.sequential is not None:
+        if isinstance(self._options().get("dynamics"), Callable):
             remedy = "Save the state_dict, and load it into a QPMPC with the same dynamics."
-            raise QPError.expected("save", "dynamics, which are code", "A and B", remedy)
+            want = "A and B, or a LearnedModel"
+            raise QPError.expected("save", "dynamics, which are code", want, remedy)
         save_file(path, KIND, stored(self))
 
     @classmethod
@@ -597,7 +598,8 @@ class QPMPC(nn.Module):
         names = ("structure", "step", "solver", "on_failure")
         options = {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
         if self.sequential is not None:
-            options["dynamics"] = self.sequential.dynamics
+            dynamics = self.sequential.dynamics
+            options["dynamics"] = getattr(dynamics, "arguments", dynamics)
             options["iterations"] = self.sequential.iterations
         return options if self.schedule is None else options | {"schedule": self.schedule.arguments}
 

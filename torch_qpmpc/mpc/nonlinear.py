@@ -27,6 +27,7 @@ from torch.nn import functional as F
 
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.layout import Layout, banded_matrix
 from torch_qpmpc.qp.batching import times
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
@@ -74,7 +75,7 @@ class RungeKutta(nn.Module):
         self.derivative, self.dt, self.steps = derivative, dt, steps
 
     def forward(self, x: Tensor, *others: Tensor) -> Tensor:
-        """Return the next state after x; the ``others`` are u, and d if there is a preview."""
+        """Return the state after x ``(*batch, n_x)``; ``others`` are u and, with a preview, d."""
         h = self.dt / self.steps
         for _ in range(self.steps):
             k_1 = self.derivative(x, *others)
@@ -143,6 +144,8 @@ class SequentialQP(nn.Module):
         self, dynamics: Callable[..., Any], layout: Layout, gamma: float, iterations: int = 1
     ) -> None:
         super().__init__()
+        if isinstance(dynamics, dict):  # of a file
+            dynamics = LearnedModel(**dynamics)
         if not callable(dynamics):
             raise QPError.expected("dynamics", repr(dynamics), "a function f(x, u) of tensors")
         check_whole("iterations", iterations, 1)

@@ -1,0 +1,206 @@
+"""A nonlinear model from a log: small networks, where they predict better than a linear model.
+
+With v = [d; x; u] the change x_{k+1} - x_k and the stage cost l_k, if there is one, are the mean of
+an ensemble of networks of v_k (Chua et al., 2018, "Deep reinforcement learning in a handful of
+trials using probabilistic dynamics models"), or linear and convex quadratic in v_k. Each network is
+trained without a part of the log, and its error there decides. Networks of what the linear model
+leaves fit the log as well, and their sum with it is worse where the log is thin.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.identification.identification import check_excitation
+from torch_qpmpc.identification.log import complete
+from torch_qpmpc.identification.reading import as_log
+from torch_qpmpc.identification.ridge import ridge
+
+#: The networks, their width, and the steps, rate and batch of their training.
+COUNT, WIDTH, STEPS, RATE, BATCH = 5, 64, 2500, 3e-3, 128
+#: Networks are used if they leave less than this share of the linear model's mean square of some
+#: output of which the linear model leaves more than the second share of the variance.
+LEFT, EXACT = 0.9, 1e-10
+
+
+class LearnedModel(nn.Module):
+    """The next state, and the stage cost if there is one; `identify_nonlinear` fits one.
+
+    Args:
+        middle, size: what standardises v, ``(n,)``.
+        base: coefficients ``(n_features, m)`` of 1, v and, with a cost, the products of v's entries
+            in the change of x and in the cost.
+        n_x: the number of states.
+        layers: weights and biases of the networks; none without any.
+        left: the share of the linear model's mean square that networks leave, ``(m,)``.
+    """
+
+    middle: Tensor
+    size: Tensor
+    base: Tensor
+    left: Tensor
+
+    def __init__(
+        self, middle: Any, size: Any, base: Any, n_x: int, layers: Any = (), left: Any = ()
+    ) -> None:
+        super().__init__()
+        self.n_x, self.depth = int(n_x), len(layers)
+        parts = {"middle": middle, "size": size, "base": base, "left": left}
+        parts |= {f"layer_{i}": layer for i, layer in enumerate(layers)}
+        for name, part in parts.items():
+            self.register_buffer(name, torch.as_tensor(part, dtype=torch.float64).clone())
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `LearnedModel` by name."""
+        layers = [getattr(self, f"layer_{i}") for i in range(self.depth)]
+        parts = {name: getattr(self, name) for name in ("middle", "size", "base", "left", "n_x")}
+        return parts | {"layers": layers}
+
+    def forward(self, x: Tensor, u: Tensor, *d: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+        """Return the next x ``(*batch, n_x)``, and the stage cost ``(*batch,)`` if observed."""
+        v = (torch.cat((*d, x, u), -1).to(self.middle) - self.middle) / self.size
+        out = _features(v, len(self.base) > 1 + v.shape[-1]) @ self.base
+        if self.depth:
+            out = out + self.networks(v)
+        after = x + out[..., : self.n_x]
+        return (after, out[..., -1]) if out.shape[-1] > self.n_x else after
+
+    def networks(self, v: Tensor) -> Tensor:
+        """Return the mean of the networks at standardised v ``(.., n)``."""
+        W_1, b_1, W_2, b_2, W_3, b_3 = (getattr(self, f"layer_{i}") for i in range(self.depth))
+        hidden = F.silu(torch.addmm(b_1, v.reshape(-1, v.shape[-1]), W_1))
+        hidden = hidden.view(len(hidden), len(W_2), -1).movedim(1, 0)
+        hidden = F.silu(torch.baddbmm(b_2, hidden, W_2)).movedim(0, 1).flatten(1)
+        return torch.addmm(b_3, hidden, W_3).reshape(*v.shape[:-1], -1)
+
+
+def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
+    """Learn the dynamics of measured outputs, which are the state, from a log.
+
+    Args:
+        trajectories: as in `identify`.
+        cost: the stage cost of each step, ``(T,)``, if the model shall have one.
+
+    Raises:
+        QPError: as in `identify`, or there are few steps, or not as many costs as steps.
+
+    Example:
+        >>> import numpy as np, torch, torch_qpmpc as qm
+        >>> u, y = np.random.default_rng(0).uniform(-1, 1, 200), np.zeros(201)
+        >>> for t in range(200):
+        ...     y[t + 1] = 0.9 * y[t] + 0.5 * u[t]
+        >>> model = qm.identify_nonlinear({"y": y, "u": u})  # no network: the plant is linear
+        >>> model(torch.ones(1), torch.ones(1))
+        tensor([1.4000], dtype=torch.float64)
+    """
+    log = as_log(trajectories)
+    check_excitation(log)
+    data = complete(log.trajectories)
+    x, after, u, d = (
+        torch.cat(part) for part in zip(*((y[:-1], y[1:], u, d) for y, u, d in data), strict=True)
+    )
+    if cost is not None:
+        cost = torch.as_tensor(cost, dtype=torch.float64).reshape(-1)
+        if len(cost) != len(u):
+            want = f"{len(u)}, one for each step with outputs before and after"
+            raise QPError.expected("cost", f"{len(cost)} numbers", want)
+    return fit_learned(torch.cat((d, x, u), -1), x, after, cost)
+
+
+def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None) -> LearnedModel:
+    """Fit a model to transitions, in the order of time.
+
+    Args:
+        v: [d; x; u], ``(T, n)``.
+        x, after: the state and the next one, ``(T, n_x)``.
+        cost: the stage costs ``(T,)``, if they are known.
+
+    Raises:
+        QPError: there are few transitions.
+    """
+    if len(v) < 2 * COUNT:
+        raise QPError.expected("trajectories", f"{len(v)} steps", f"at least {2 * COUNT}")
+    v, target, n_x = v.double(), (after - x).double(), x.shape[1]
+    middle, size = v.mean(0), v.std(0, correction=0)
+    size = torch.where(size > 1e-12 * v.abs().amax(0), size, 1.0)
+    target = target if cost is None else torch.cat((target, cost.double().unsqueeze(-1)), -1)
+    v = (v - middle) / size
+    features = _features(v, cost is not None)
+    linear = features[:, : 1 + v.shape[1]]
+    base = F.pad(ridge(linear, target[:, :n_x]), (0, 0, 0, features.shape[1] - linear.shape[1]))
+    if cost is not None:
+        base = torch.cat((base, _convex(linear, features, target[:, n_x:])), -1)
+    mean, spread = target.mean(0), target.std(0, correction=0)
+    rest = (target - features @ base).square().mean(0)
+    wanted, layers = rest > EXACT * spread.square(), ()
+    left = torch.ones_like(rest)
+    if wanted.any():
+        spread = torch.where(spread > 0, spread, 1.0)
+        layers, error = _trained(v.float(), ((target - mean) / spread).float())
+        left = torch.where(wanted, error * spread.square() / rest, 1.0)
+        W_1, b_1, W_2, b_2, W_3, b_3 = (x.detach().double() for x in layers)
+        first = W_1.movedim(0, 1).flatten(1), b_1.flatten()
+        last = (W_3 / COUNT).flatten(0, 1) * spread, b_3.mean((0, 1)) * spread + mean
+        layers = (*first, W_2, b_2, *last) if (left < LEFT).any() else ()
+        base = base * (not layers)
+    return LearnedModel(middle, size, base, n_x, layers, left)
+
+
+def _features(v: Tensor, products: bool) -> Tensor:
+    """Return 1, v ``(.., n)`` and, with ``products``, those of its entries."""
+    parts = [torch.ones_like(v[..., :1]), v]
+    if products:
+        rows, columns = torch.triu_indices(v.shape[-1], v.shape[-1], device=v.device)
+        parts.append(v[..., rows] * v[..., columns])
+    return torch.cat(parts, -1)
+
+
+def _convex(linear: Tensor, features: Tensor, cost: Tensor) -> Tensor:
+    """Return coefficients of a convex quadratic cost, ``(n_features, 1)``."""
+    n = linear.shape[1]
+    rows, columns = torch.triu_indices(n - 1, n - 1)
+    W = cost.new_zeros(n - 1, n - 1)
+    W[rows, columns] = ridge(features, cost)[n:, 0]
+    values, vectors = torch.linalg.eigh(W + W.mT)
+    W = (vectors * values.clamp(min=0)) @ vectors.mT
+    entries = (W[rows, columns] * torch.where(rows == columns, 0.5, 1.0)).unsqueeze(1)
+    return torch.cat((ridge(linear, cost - features[:, n:] @ entries), entries))
+
+
+def _trained(v: Tensor, target: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Train each network without a part of the rows; return them, and their errors there."""
+    generator = torch.Generator().manual_seed(0)
+    sizes, layers = (v.shape[1], WIDTH, WIDTH, target.shape[1]), []
+    for n, m in itertools.pairwise(sizes):
+        layers += [torch.randn(COUNT, n, m, generator=generator) / n**0.5, torch.zeros(COUNT, 1, m)]
+
+    def outputs(x: Tensor) -> Tensor:
+        for i in range(0, len(layers), 2):
+            x = torch.baddbmm(layers[i + 1], x, layers[i])
+            x = F.silu(x) if i + 2 < len(layers) else x
+        return x
+
+    parts = torch.arange(len(v)) * 2 * COUNT // len(v)
+    pools = [(parts != 2 * k).nonzero().squeeze(1) for k in range(COUNT)]
+    adam = torch.optim.AdamW([x.requires_grad_() for x in layers], RATE, weight_decay=1e-4)
+    rate = torch.optim.lr_scheduler.CosineAnnealingLR(adam, STEPS)
+    with torch.enable_grad():
+        for _ in range(STEPS):
+            draws = torch.rand(COUNT, BATCH, generator=generator)
+            rows = [pool[(x * len(pool)).long()] for pool, x in zip(pools, draws, strict=True)]
+            rows = torch.stack(rows)
+            loss = (outputs(v[rows]) - target[rows]).square().mean()
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+            rate.step()
+    with torch.no_grad():
+        own = outputs(v.expand(COUNT, *v.shape))[parts // 2, torch.arange(len(v))]
+        return layers, (own - target)[parts % 2 == 0].double().square().mean(0)
