@@ -172,3 +172,10 @@ def test_what_has_no_solution_is_left_as_it_was():
     candidate = solution._replace(chi=chi)
     refine(p, candidate, np.arange(2))
     assert_close(candidate.z, solution.z, rtol=0, atol=0)
+
+
+def test_rows_that_are_dependent_up_to_rounding_are_certified():
+    """A basis of rows whose sine was just above 1e-14 made an exact answer's error 36."""
+    case = FAMILIES["dependent rows"](Draw(3), 128)
+    solution = solve_qp(case.known.qp, case.known.fixed, solver="torch", on_failure="mask")
+    assert solution.solved.all()

@@ -82,8 +82,8 @@ ROUNDING = 1e-15
 DOUBTFUL = 1e-8
 #: A hard row is nearly active if its slack is this small, relatively.
 NEARLY_ACTIVE = 1e-6
-#: Rows of G are dependent if the sine of their angle is below this, and agree within this.
-DEPENDENT = 1e-14
+#: Rows whose angle has a smaller sine, as rounding leaves, are dependent, and agree within this.
+DEPENDENT = 1e-13
 
 
 class Terms(NamedTuple):
