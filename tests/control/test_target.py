@@ -97,6 +97,17 @@ def test_zones_hold_the_outputs_that_free_inputs_move(seed):
         assert abs((np.abs(y[1:]) - half).clip(0).sum() - z[3:].sum()) < 1e-6
 
 
+def test_a_target_at_a_zone_takes_few_rounds(monkeypatch):
+    """The rounds shrink geometrically: two of them tell where they end."""
+    A, B = np.diag([0.9, 0.8]), np.array([[0.1, 0.02], [0.01, 0.2]])
+    zone = {"y_bounds": ([-np.inf, -0.2], [np.inf, 0.2]), "u_bounds": (-3.0, 3.0)}
+    mpc = qm.LinearMPC((A, B), 2, Q=[1.0, 0.0], R=0.01, **zone)
+    calls, solve = [], mpc.targets.solve
+    monkeypatch.setattr(mpc.targets, "solve", lambda *a, **k: calls.append(1) or solve(*a, **k))
+    assert np.allclose(mpc.target([3.0, 0.0]).y, [3.0, 0.2], atol=1e-8)
+    assert 1 < len(calls) <= 6
+
+
 def test_many_inputs_of_one_output_have_bounds_of_its_own():
     """The gains of 24 inputs within 1 add up to the output that they can hold."""
     B = np.random.default_rng(0).uniform(0.1, 1, (1, 24))

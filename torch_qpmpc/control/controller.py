@@ -46,9 +46,8 @@ class Controller:
         drift: standard deviations of each disturbance's change in a step; by default it moves an
             output by its identified noise within the horizon. Without one, as ``noise``. A larger
             ratio of drift to noise rejects disturbances faster and passes on more noise.
-        gain: L of an observer of your own, ``(n + n_w, n_y)``, which corrects [x; w] by L times the
-            error of the prediction, or a function of `Observer`'s F and H that returns it. Another
-            model, noise or drift brings the Kalman filter back.
+        gain: L ``(n + n_w, n_y)`` of an observer of your own, see `Observer`, or a function of F
+            and H that returns it. Another model, noise or drift brings the Kalman filter back.
 
     Attributes:
         status: the `Outcome` of the last step, SOLVED before the first.
@@ -220,8 +219,7 @@ class Controller:
     def redesign(self, **changes: Any) -> None:
         """Change weights, bounds and the filter between two steps; the estimates stay.
 
-        So does the last input, and what is not named. Without ``noise`` and ``drift`` the observer
-        stays: it follows from the bounds that the controller was made with.
+        So do the last input, what is not named and, without ``noise`` and ``drift``, the observer.
 
         Args:
             changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
@@ -375,9 +373,7 @@ class Controller:
         return review(self._law.renewed(), self._memory, r, known)
 
     def explain(self) -> Explanation:
-        """Return why the last step did what it did, in names and units; ``print`` shows it.
-
-        It has the plan, the bounds that hold it back, the disturbances, and what is in reach.
+        """Return the last plan, what holds it back, and what is in reach; ``print`` shows it.
 
         Raises:
             QPError: the last call was no `step`.

@@ -266,10 +266,8 @@ class Design:
         return nominal
 
     def answers(self, shows: float) -> Array:
-        """Return the first step in which an input moves each output its final way, ``(n_y,)``.
-
-        Smaller responses than a part ``shows`` of the largest of the next ten steps do not.
-        """
+        """Return the first steps in which inputs move outputs their final way, ``(n_y,)``."""
+        # By a part ``shows`` of the largest move of the next ten steps.
         plant, x, steps = self.plant, self.plant.B * self.scaling.u, []
         for _ in range(max(10 * self.horizon, 200)):
             steps.append(plant.C @ x)

@@ -17,7 +17,7 @@ import torch
 from torch_qpmpc.control.design import largest
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
 from torch_qpmpc.control.linear_mpc import LinearMPC
-from torch_qpmpc.control.lowering import ROUNDS, STAYS
+from torch_qpmpc.control.lowering import ROUNDS, SHRINKS, STAYS
 from torch_qpmpc.control.observer import STEADY
 from torch_qpmpc.control.simulation import centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
@@ -345,6 +345,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         **dict(zip(("MOVE_LOWER", "MOVE_UPPER"), _moves(law.mpc, dtype), strict=True)),
         **dict(zip(("MOST_Y", "MOST_KNOWN"), law.max_plausible, strict=True)),
         "MOST_U": law.max_plausible_u,
+        "SHRINKS": np.array([SHRINKS]),
         "STAYS": np.array([max(STAYS, 100 * np.finfo(dtype).eps)]),
         **({"INPUT_LEVELS": law.levels, "SWITCH": law.switches} if design.levels else {}),
     }

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torch_qpmpc.control.design import Design, largest, read_wished
 from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.lowering import ROUNDS, stays
+from torch_qpmpc.control.lowering import ROUNDS, followed
 from torch_qpmpc.control.observer import (
     ABSURD,
     SMALL,
@@ -281,20 +281,17 @@ class Law:
     def _aimed(self, r: Array, d: Array, w: Array) -> list[Array] | None:
         """Return the parts of `LinearMPC.target` of a set-point; None if a QP has no solution."""
         loads, n_f = np.concatenate((w, d - self.design.nominal, [1.0])), self.mpc.anchors
-        v, lam, f = np.zeros(0), np.zeros(0), np.zeros(n_f)
+        v, lam, now = np.zeros(0), np.zeros(0), (np.zeros(n_f), None)
         for _ in range(ROUNDS):
-            state = np.concatenate((f, r, loads))
-            solution = self.aims[0].solve(state[None])
-            if solution.status[0]:
+            state = np.concatenate((now[0], r, loads))
+            if (solution := self.aims[0].solve(state[None])).status[0]:
                 return None
             v, lam = solution.z[0, len(state) : -len(state)], solution.lam[0]
-            last, f = f, v[len(v) - n_f :]
-            if stays(f, last):
+            if (now := followed(v[len(v) - n_f :], *now)) is None:
                 break
         for aims in self.aims[1:]:
             state = np.concatenate((v[: len(v) - n_f], loads))
-            solution = aims.solve(state[None])
-            if solution.status[0]:
+            if (solution := aims.solve(state[None])).status[0]:
                 return None
             v = np.concatenate((v[: len(v) - n_f], solution.z[0, len(state) : -len(state)]))
         x, u, y = (Z @ v + M @ loads for Z, M in self.design.steady.maps)

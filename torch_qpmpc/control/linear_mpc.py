@@ -27,7 +27,7 @@ from torch_qpmpc.control.design import (
     within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import ROUNDS, anchored, free_mpc, lowered, stays, target_mpc
+from torch_qpmpc.control.lowering import ROUNDS, anchored, followed, free_mpc, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
@@ -291,12 +291,11 @@ class LinearMPC:
         batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
         r, w, known = _expanded(parts, zip(sizes), batch)
         s = torch.cat((r, w, known - nominal, r.new_ones(*batch, 1)), -1)
-        f = s.new_zeros(*batch, self.anchors)
+        now = s.new_zeros(*batch, self.anchors), None
         for _ in range(ROUNDS):
-            solution = self.targets.solve(torch.cat((f, s), -1), qp=self._target_qps[0])
+            solution = self.targets.solve(torch.cat((now[0], s), -1), qp=self._target_qps[0])
             v = self.targets.predicted(solution.z)[1][..., 0, :]
-            last, f = f, v[..., v.shape[-1] - self.anchors :]
-            if stays(f, last):
+            if (now := followed(v[..., v.shape[-1] - self.anchors :], *now)) is None:
                 break
         if self.free is not None:
             a = v[..., : v.shape[-1] - self.anchors]

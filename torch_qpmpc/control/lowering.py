@@ -48,8 +48,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 SCALE = 1e-2
 #: An eigenvalue this near to the unit circle is on it.
 ON_CIRCLE = 1e-6
-#: The weight of f - f_0 relative to the outputs'; the most rounds, and the f that stays.
-PREFERENCE, ROUNDS, STAYS = 1e-2, 50, 1e-10
+#: The weight of f - f_0 relative to the outputs', the most rounds, f that stay, and moves alike.
+PREFERENCE, ROUNDS, STAYS, SHRINKS = 1e-2, 50, 1e-10, 0.9
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep, relative
 #: to the default one.
 HARD = 1e3
@@ -220,9 +220,19 @@ def anchored(design: Design) -> int:
     return len(design.steady.W) if design.steady.n_a else 0
 
 
-def stays(f: Any, last: Any) -> bool:
-    """Return True if the f of two rounds, in arrays or tensors, are the same."""
-    return bool((abs(f - last) <= STAYS * (1 + abs(f))).all())
+def followed(f: Any, f_0: Any, before: Any = None) -> tuple[Any, Any] | None:
+    """Return the next f_0 and the move to f, None if f stays; in arrays or tensors.
+
+    After two moves in a row it is where moves end that go on to shrink alike (Aitken's method).
+    """
+    move = f - f_0
+    if (abs(move) <= STAYS * (1 + abs(f))).all():
+        return None
+    if before is None:
+        return f, move
+    share = (move * before).sum(-1) / ((before * before).sum(-1) + TINY**20)
+    share = share.clip(0, SHRINKS)[..., None]
+    return f + move * share / (1 - share), None
 
 
 def target_mpc(design: Design) -> QPMPC:

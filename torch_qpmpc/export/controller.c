@@ -255,8 +255,8 @@ static void weigh(policy_state *s, const real r[])
 /* Set the target for the signals of a stage; return the code of its QPs. */
 static int aim(policy_state *s, const real r[], const real known[])
 {
-    real loads[LOADS], t[POLICY_TARGET_N_P], v[N_V];
-    int i, round, stays = 0, code = POLICY_SOLVED;
+    real loads[LOADS], t[POLICY_TARGET_N_P], v[N_V], move[N_V];
+    int i, round, stays = 0, follows = 0, code = POLICY_SOLVED;
     copy(loads, s->e + N_X, N_W);
     for (i = 0; i < N_D; i++) loads[N_W + i] = known[i] - NOMINAL[i];
     loads[LOADS - 1] = 1;
@@ -264,12 +264,19 @@ static int aim(policy_state *s, const real r[], const real known[])
     copy(t + N_F, r, N_Y);
     copy(t + N_F + N_Y, loads, LOADS);
     for (round = 0; round < POLICY_ROUNDS && !stays && code == POLICY_SOLVED; round++) {
+        real share = 0, size = 0;
         code = policy_target_step(&s->target, t, v, 0);
         for (i = 0, stays = 1; i < N_F; i++) {
             real f = v[N_A + i], by = f - t[i], near = STAYS[0] * (1 + (f < 0 ? -f : f));
             if (!(by <= near && -by <= near)) stays = 0;
-            t[i] = f;
+            if (follows) share += by * move[i];
+            if (follows) size += move[i] * move[i];
+            move[i] = by;
         }
+        share = share > 0 ? share / size : 0;
+        if (share > SHRINKS[0]) share = SHRINKS[0];
+        for (i = 0; i < N_F; i++) t[i] = v[N_A + i] + move[i] * share / (1 - share);
+        follows = !follows;
     }
 #if POLICY_FREE
     if (code == POLICY_SOLVED) {
