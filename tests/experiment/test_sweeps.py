@@ -68,6 +68,7 @@ def test_a_sweep_resumes(tmp_path, capsys):
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
     assert (second / "summary.json").exists()
     assert not (second / "tensorboard" / "stale").exists()
+    assert capsys.readouterr().out.endswith(f"\npython -m torch_qpmpc.report {tmp_path}\n")
 
     with pytest.raises(SystemExit) as changed:
         sweep(tmp_path, "seed=1", "exploration_std=0.2")

@@ -159,22 +159,23 @@ class Interrupt:
 
 
 class SubFolders(Callback):
-    """Reduces Hydra's ``override_dirname`` to the overrides that the sweep varies.
-
-    The noise, the constraint and the seed are already in the sub-folder's name.
-    """
+    """Names sub-folders by the overrides that a sweep varies; its end names the report."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         varied = config.hydra.sweeper.get("params") or {}
         overrides = OverridesParser.create().parse_overrides(config.hydra.overrides.task)
         fixed = [x for x in overrides if not x.is_sweep_override()]
         excluded = [x.key_or_group for x in fixed if x.get_key_element() not in varied]
-        excluded += ["noise", "constraint", "seed"]
+        excluded += ["noise", "constraint", "seed"]  # in the name already
         # Each run composes its configuration from these overrides and its own.
         with open_dict(config), read_write(config):
             config.hydra.overrides.hydra.append(
                 f"hydra.job.config.override_dirname.exclude_keys={excluded}"
             )
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Name the command that makes the table of the runs."""
+        print(f"\npython -m torch_qpmpc.report {shlex.quote(config.hydra.sweep.dir)}", flush=True)
 
 
 def sub_folder(*names: str) -> str:
