@@ -127,6 +127,20 @@ def test_without_a_plan_the_input_stays_on_a_level():
     assert controller.status.name == "INVALID"
 
 
+@pytest.mark.skipif(compiler() is None, reason="no C compiler")
+def test_a_limit_that_is_a_known_signal_holds_with_and_without_a_plan_alike_in_c(tmp_path):
+    limit = {"known": ["most"], "E": [[0.0]], "u_bounds": {"q": (0.0, "most")}}
+    controller = qm.Controller(of(**limit, min_on=1))
+    twin = load(controller.export_c(tmp_path).files, controller)
+    limits, expected = (9, 9, 7, 7, 3, 9, 9), (0, 8, 4, 4, 0, 0, 0)  # off twice by min_off
+    for k, (most, wanted) in enumerate(zip(limits, expected, strict=True)):
+        known, r = np.full((9, 1), most), [8.0 if k % 2 else np.nan]
+        u = controller.step([1.0], r=r, known=known)
+        got, code = twin.step([1.0], r, known)
+        assert (got[0], code) == (u[0], controller.status)
+        assert u[0] == wanted
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [

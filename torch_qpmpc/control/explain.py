@@ -69,8 +69,7 @@ class Explanation:
             levels = self.design.levels.get(name, ())
             decided = self.u[: self.design.switching.get("integer_horizon"), i]
             changed = np.flatnonzero(np.abs(np.diff(decided)) > ACTIVE * self.design.scaling.u[i])
-            if levels and len(changed):
-                k = changed[0] + 1
+            for k in 1 + changed[:1] if levels else ():
                 to = "off" if decided[k] < np.mean(levels[:2]) else f"to {decided[k]:.4g}"
                 lines.append(f"{name} goes {to} in {k} step{'s' * bool(k > 1)}")
         for name, x in self.disturbances.items():

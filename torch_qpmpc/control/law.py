@@ -230,7 +230,7 @@ class Law:
             return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
         status = Outcome.NODE_LIMIT if found == Status.NODE_LIMIT else status
         u = self._within(aimed[-1][1] + z[qp.n_p : qp.n_p + qp.n_u], memory)
-        u, memory = self._on_level(u), memory._replace(ahead=ahead)
+        u, memory = self._on_level(u, memory), memory._replace(ahead=ahead)
         target = Target(*map(torch.from_numpy, steady))
         return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p), plan)
 
@@ -265,16 +265,18 @@ class Law:
                 want = f"one that is {word} for {left:g} more steps, by min_{word}"
                 raise QPError.expected("u_bounds", got, want, "Change them then.")
 
-    def _on_level(self, u: Array) -> Array:
-        """Return inputs at their nearest levels within their bounds."""
+    def _on_level(self, u: Array, memory: Memory) -> Array:
+        """Return inputs at their nearest levels within their bounds now."""
         if not self.design.levels:
             return u
-        nearest = self.levels[np.arange(len(u)), np.abs(self.levels - u[:, None]).argmin(1)]
-        return np.where(np.isfinite(nearest), nearest, u)
+        inside = self.levels == self._within(self.levels.T, memory).T
+        off = np.where(inside, np.abs(self.levels - u[:, None]), np.inf)
+        nearest = self.levels[np.arange(len(u)), off.argmin(1)]
+        return np.where(np.isfinite(off.min(1)), nearest, u)
 
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
-        u = self._on_level(self._within(memory.u, memory))
+        u = self._on_level(self._within(memory.u, memory), memory)
         memory = memory._replace(ahead=None)
         return Move(u, self._after(memory, e, u), status)
 

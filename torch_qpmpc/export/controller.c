@@ -55,13 +55,16 @@ static real within(const policy_state *s, real x, int i)
 }
 
 #if POLICY_LEVELS
-/* Return the level of input i that is nearest to x; without levels x. */
-static real on_level(real x, int i)
+/* Return the level of input i within its bounds that is nearest to x; without one x. */
+static real on_level(const policy_state *s, real x, int i)
 {
-    real level = INPUT_LEVELS[i][0];
+    real level = BIG;
     int k;
-    for (k = 1; k < POLICY_LEVELS; k++)
-        if (x > (INPUT_LEVELS[i][k - 1] + INPUT_LEVELS[i][k]) / 2) level = INPUT_LEVELS[i][k];
+    for (k = 0; k < POLICY_LEVELS; k++) {
+        real next = INPUT_LEVELS[i][k];
+        int inside = next < BIG && within(s, next, i) == next;
+        if (inside && (level >= BIG || x - level > next - x)) level = next;
+    }
     return level < BIG ? level : x;
 }
 
@@ -379,7 +382,7 @@ int policy_step(policy_state *s, const real y[], const real r[], const real know
     code = seen == POLICY_INVALID || !sane ? POLICY_INVALID : plan(s, known);
     for (i = 0; i < N_U; i++) s->u[i] = within(s, s->u[i], i);
 #if POLICY_LEVELS
-    for (i = 0; i < N_U; i++) s->u[i] = on_level(s->u[i], i);
+    for (i = 0; i < N_U; i++) s->u[i] = on_level(s, s->u[i], i);
     count(s, s->u);
     if (code != POLICY_SOLVED && code != POLICY_NODE_LIMIT) s->plan.hint[0] = -1;
 #endif

@@ -54,9 +54,10 @@ static real allowed(policy_state *s, signed char *first, signed char *last)
 }
 
 /* Hold the rows between levels, and give those that are held the side of their multipliers. */
-static void hold_between(policy_state *s, const signed char *first, const signed char *last)
+static void hold_between(policy_state *s, const signed char *first, const signed char *last, real most)
 {
     int i;
+    s->cutoff = most; /* of the cost */
     for (i = 0; i < DECISIONS; i++) {
         s->low[LEVEL_ROW[i]] = LEVEL[i][first[i]];
         s->high[LEVEL_ROW[i]] = LEVEL[i][last[i]];
@@ -75,13 +76,13 @@ static int undecided(policy_state *s, int any)
     int i, e, k, a, found = -1;
     for (k = 0; k < DECIDED; k++)
         for (a = 0; a < POLICY_LEVELS; a++) {
-            real y = s->y[LEVEL_ROW[i = a * DECIDED + k]], off;
+            real y = s->y[LEVEL_ROW[i = a * DECIDED + k]];
             int at = s->first[i];
             for (e = at + 1; e <= s->last[i]; e++)
                 if (absolute(LEVEL[i][e] - y) < absolute(LEVEL[i][at] - y)) at = e;
-            off = absolute(LEVEL[i][at] - y);
             s->pattern[i] = (signed char)at;
-            if (found < 0 && s->first[i] < s->last[i] && (any || off > ON_LEVEL[i])) found = i;
+            if (s->first[i] == s->last[i] || (!any && absolute(LEVEL[i][at] - y) <= ON_LEVEL[i])) continue;
+            if (found < 0) found = i;
         }
     return found;
 }
@@ -107,8 +108,7 @@ static int search(policy_state *s, policy_info *info, real *starts)
         }
         cost = allowed(s, s->first, s->last);
         if (cost < limit) {
-            hold_between(s, s->first, s->last);
-            s->cutoff = limit - cost;
+            hold_between(s, s->first, s->last, limit - cost);
             if (solve(s, TIGHT, &iterations) != POLICY_INFEASIBLE) least = s->cost;
             info->iterations += iterations;
         }
@@ -154,7 +154,6 @@ static int search(policy_state *s, policy_info *info, real *starts)
         if (x != 0 && kind == HELD) s->held[s->n_held++] = i;
     }
     refactor(s);
-    hold_between(s, s->plan, s->plan);
-    s->cutoff = BIG;
+    hold_between(s, s->plan, s->plan, BIG);
     return depth ? POLICY_NODE_LIMIT : POLICY_SOLVED;
 }

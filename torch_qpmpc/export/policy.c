@@ -489,8 +489,7 @@ void policy_reset(policy_state *s)
     restart(s);
     for (i = 0; i < POLICY_N_U; i++) s->u[i] = smaller(larger(0, U_LOWER[i]), U_UPPER[i]);
 #if POLICY_LEVELS
-    for (i = 0; i < POLICY_N_U; i++) s->runs[i] = 0;
-    s->hint[0] = -1;
+    for (s->hint[0] = -1, i = 0; i < POLICY_N_U; i++) s->runs[i] = 0;
 #endif
 }
 

@@ -33,9 +33,8 @@ typedef struct {
     int n_held;
     signed char kind[POLICY_ROWS_];            /* see policy.c */
 #if POLICY_LEVELS
-    policy_real low[POLICY_ROWS_], high[POLICY_ROWS_]; /* bounds in a node, and its cost */
-    policy_real cost, cutoff, best[POLICY_ROWS_];      /* the best plan's multipliers */
-    policy_real ahead[POLICY_DECIDED + 1][POLICY_RUNS], bounds[POLICY_DEPTH];
+    policy_real low[POLICY_ROWS_], high[POLICY_ROWS_], cost, cutoff; /* of a node: bounds, cost */
+    policy_real ahead[POLICY_DECIDED + 1][POLICY_RUNS], bounds[POLICY_DEPTH], best[POLICY_ROWS_];
     int at[POLICY_DEPTH], runs[POLICY_N_U]; /* runs: steps on, or minus steps off, before the next step */
     signed char cut[POLICY_DEPTH], above[POLICY_DEPTH], open[POLICY_DEPTH]; /* the branch of a node */
     signed char first[POLICY_DECISIONS], last[POLICY_DECISIONS];            /* what it leaves */
@@ -58,9 +57,8 @@ void policy_reset(policy_state *state);
 
    u is always written, within the action bounds: the optimal action if the code is 0, that of the
    best plan found with code 5, of the last iterate with the codes 1 and 2, and with code 3 the last
-   action. info may be a null pointer.
-
-   Minimum times count from the state's runs, which are 0 after a reset: unknown. Set them. */
+   action. info may be a null pointer. Minimum times count from the state's runs, which are 0 after
+   a reset: unknown. Set them. */
 int policy_step(policy_state *state, const policy_real p[], policy_real u[], policy_info *info);
 
 /* Compare with actions of an exact solver; return 0, or the number of the first state that fails.
