@@ -271,8 +271,7 @@ class Law:
             return u
         inside = self.levels == self._within(self.levels.T, memory).T
         off = np.where(inside, np.abs(self.levels - u[:, None]), np.inf)
-        nearest = self.levels[np.arange(len(u)), off.argmin(1)]
-        return np.where(np.isfinite(off.min(1)), nearest, u)
+        return np.where(off.min(1) < np.inf, self.levels[np.arange(len(u)), off.argmin(1)], u)
 
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""

@@ -250,8 +250,8 @@ def _levels(law: Law, r: Array, known: Array) -> Finding:
     text = f"In a loop of the model: {'; '.join(spans)}. A step costs {costs[1]:.4g}, "
     text += f"without levels {costs[0]:.4g}."
     lower, upper = design.bounds_at(known)[0]
-    off = np.maximum(lower - y, y - upper).max(0) > OUTSIDE * design.scaling.y
-    names = " and ".join(np.array(plant.outputs)[off])
+    off = np.maximum(lower - y, y - upper).max(0) / design.scaling.y
+    names = " and ".join(np.array(plant.outputs)[off > OUTSIDE])
     remedy = f"Shorten min_on or min_off, add a level, or widen y_bounds of {names}."
     return Finding("levels", not names, text, remedy * bool(names))
 
