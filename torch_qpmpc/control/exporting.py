@@ -43,7 +43,7 @@ class ControllerExport:
 
     Attributes:
         files: the paths of all files.
-        plan, target, free: the reports of the QPs; free inputs have one or None.
+        plan, target: the reports of the QPs.
         table_bytes, state_bytes: the sizes of all constant tables, without self-tests, and of the
             state, None without a compiler.
         steps, difference: the length of the closed loop that is compared, and the largest
@@ -54,7 +54,6 @@ class ControllerExport:
     files: tuple[Path, ...]
     plan: Export
     target: Export
-    free: Export | None
     table_bytes: int
     state_bytes: int | None
     steps: int
@@ -133,12 +132,11 @@ def export_controller(
     dtype = options.get("dtype", "float64")
     mpc, known = law.mpc, last_known(law.design, memory)
     with tempfile.TemporaryDirectory() as temporary:
-        parts = {"plan": mpc.plan, "target": mpc.targets, "free": mpc.free}
-        plan, target, free = (
-            part and export_c(part, temporary, name=f"{name}_{key}", **options)
+        parts = {"plan": mpc.plan, "target": mpc.targets}
+        reports = plan, target = [
+            export_c(part, temporary, name=f"{name}_{key}", **options)
             for key, part in parts.items()
-        )
-        reports = [x for x in (plan, target, free) if x]
+        ]
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
     course = _course(law, known)
     start = course["u"]
@@ -166,7 +164,7 @@ def export_controller(
     own += sum(part.table_bytes for part in reports)
     files = tuple(map(folder.joinpath, texts))
     most = None if difference is None else float(difference.max())
-    return ControllerExport(files, plan, target, free, own, state_bytes, len(loop.u), most, missing)
+    return ControllerExport(files, plan, target, own, state_bytes, len(loop.u), most, missing)
 
 
 def export_controller_fmu(
@@ -317,7 +315,7 @@ def _sizes(law: Law) -> dict[str, int]:
     of |= {"BOUNDED_Y": "y_s", "BOUNDED_U": "u_s"}
     sizes = {"N_X": n, "N_W": n_e - n, "N_E": n_e, "N_U": m, "N_Y": n_y, "N_D": n_d}
     sizes |= {"N_D_": max(n_d, 1), "GAINS": len(observer.gains), "STAGES": stages}
-    sizes |= {"FREE": int(law.mpc.free is not None), "N_F": law.mpc.anchors, "ROUNDS": ROUNDS}
+    sizes |= {"N_F": law.mpc.anchors, "ROUNDS": ROUNDS}
     sizes |= {"SET_POINTS": stages if design.references == "preview" else 1}
     sizes |= {"WEIGHTED": len(design.weighted), "PULLS": int(design.pulls[1].size > 0)}
     sizes |= {"LEVELS": law.levels.shape[1], "RUNS": max(levels.rules.sum(1)) if levels else 0}

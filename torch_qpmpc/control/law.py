@@ -165,9 +165,9 @@ class Law:
         return Searches(self.mpc.plan) if self.mpc.plan.levels else self.mpc.plan.at_rest()
 
     @cached_property
-    def aims(self) -> list[AtRest]:
-        """The solvers of the target's QPs."""
-        return [x.at_rest() for x in (self.mpc.targets, self.mpc.free) if x is not None]
+    def aims(self) -> AtRest:
+        """The solver of the target's QP."""
+        return self.mpc.targets.at_rest()
 
     def renewed(self) -> Law:
         """Return the law with today's theta."""
@@ -285,16 +285,11 @@ class Law:
         v, lam, now = np.zeros(0), np.zeros(0), (np.zeros(n_f), None)
         for _ in range(ROUNDS):
             state = np.concatenate((now[0], r, loads))
-            if (solution := self.aims[0].solve(state[None])).status[0]:
+            if (solution := self.aims.solve(state[None])).status[0]:
                 return None
             v, lam = solution.z[0, len(state) : -len(state)], solution.lam[0]
             if (now := followed(v[len(v) - n_f :], *now)) is None:
                 break
-        for aims in self.aims[1:]:
-            state = np.concatenate((v[: len(v) - n_f], loads))
-            if (solution := aims.solve(state[None])).status[0]:
-                return None
-            v = np.concatenate((v[: len(v) - n_f], solution.z[0, len(state) : -len(state)]))
         x, u, y = (Z @ v + M @ loads for Z, M in self.design.steady.maps)
         return [x, u, y, self.design.weighed(np, r, y, lam)]
 

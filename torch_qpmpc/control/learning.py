@@ -332,8 +332,7 @@ class ControlledPlant(SimulatedPlant):
         observer = Innovations(own.F, own.G, own.E, own.offset, own.H, *ends)
         super().__init__(models, observer, log.trajectories, self.cost, law.design.horizon)
         self._mpc, self._design, self._from_log = law.mpc, law.design, True
-        for mpc in filter(None, (law.mpc.targets, law.mpc.free)):
-            mpc.on_failure = "mask"
+        law.mpc.targets.on_failure = "mask"
         self._levels = [*map(torch.as_tensor, (middle, size, *law.design.y_bounds))]
         inside = (self._y.clamp(*self._levels[2:]) == self._y).all(-1)
         self._rows = self._rows[inside | ~inside.any()]

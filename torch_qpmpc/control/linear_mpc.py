@@ -27,7 +27,7 @@ from torch_qpmpc.control.design import (
     within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import ROUNDS, anchored, followed, free_mpc, lowered, target_mpc
+from torch_qpmpc.control.lowering import ROUNDS, anchored, followed, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
@@ -110,7 +110,6 @@ class LinearMPC:
         plan: the `QPMPC` of the plan, with V, Q, the policy and what is learned.
         targets: the QPMPC whose policy maps [f_0; r; w; d; 1] to the target, and anchors: the
             length of f_0; see `torch_qpmpc.control.lowering`.
-        free: the one of the inputs that the target leaves free, None if there are none.
 
     Raises:
         QPError: an argument is invalid, or nothing has a cost.
@@ -195,10 +194,8 @@ class LinearMPC:
     def _start(self, design: Design, options: dict[str, Any]) -> None:
         """Make the QPs; those of the target are not learned."""
         self.design, self.plan = design, QPMPC(lowered(design), **{**OPTIONS, **options})
-        self.targets, self.free = target_mpc(design), free_mpc(design)
-        self.anchors = anchored(design)
-        aims = [mpc for mpc in (self.targets, self.free) if mpc is not None]
-        self._target_qps = [mpc.quadratic_program() for mpc in aims]
+        self.targets, self.anchors = target_mpc(design), anchored(design)
+        self._target_qp = self.targets.quadratic_program()
 
     @property
     def horizon(self) -> int:
@@ -293,14 +290,10 @@ class LinearMPC:
         s = torch.cat((r, w, known - nominal, r.new_ones(*batch, 1)), -1)
         now = s.new_zeros(*batch, self.anchors), None
         for _ in range(ROUNDS):
-            solution = self.targets.solve(torch.cat((now[0], s), -1), qp=self._target_qps[0])
+            solution = self.targets.solve(torch.cat((now[0], s), -1), qp=self._target_qp)
             v = self.targets.predicted(solution.z)[1][..., 0, :]
             if (now := followed(v[..., v.shape[-1] - self.anchors :], *now)) is None:
                 break
-        if self.free is not None:
-            a = v[..., : v.shape[-1] - self.anchors]
-            state = torch.cat((a, s[..., len(self.design.Q) :]), -1)
-            v = torch.cat((a, self.free.policy(state, qp=self._target_qps[1])), -1)
         return self.steady_state(v, s, solution.lam)
 
     def steady_state(self, v: Tensor, s: Tensor, lam: Tensor) -> Target:

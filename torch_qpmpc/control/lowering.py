@@ -18,8 +18,7 @@ where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known sig
 Where several steady states have the same outputs with a weight, v = [a; f], the state is [f_0; r;
 w; d; 1], and f - f_0 has a weight. From f_0 = 0 the QP is solved again about its own f until that
 stays (the proximal point method, Rockafellar, SIAM J. Control Optim. 14, 1976): a weight so small
-that it moves no output off r would cost numbers in C their digits. Where f moves no output with
-bounds, it is then the policy of a second QPMPC with the state [a; w; d; 1]: least inputs.
+that it moves no output off r would cost numbers in C their digits.
 """
 
 from __future__ import annotations
@@ -263,22 +262,6 @@ def target_mpc(design: Design) -> QPMPC:
     rows = zip((D, lower, upper), soft, strict=True)
     rows = tuple(np.concatenate((of_u, of_y[moved])) for of_u, of_y in rows)
     return _of_one_stage(n_x, weight, SCALE * design.typical, rows, slack)
-
-
-def free_mpc(design: Design) -> QPMPC | None:
-    """Return the QPMPC whose policy maps [a; w; d; 1] to f, None if f has no QP of its own."""
-    steady, n_a = design.steady, design.steady.n_a
-    if not anchored(design) or steady.Y[design.bounded[0], n_a:].any():
-        return None
-    n_x = n_a + steady.u.shape[1]
-    n_d = design.plant.sizes[3]
-    D = np.hstack((steady.U[:, :n_a], steady.u, steady.U[:, n_a:]))
-    *rows, of = design.rows(1, D, np.eye(n_d, D.shape[1], n_x - 1 - n_d))
-    D, *sides = ((part.T / design.scaling.u[of]).T for part in rows)
-    size = float(np.linalg.norm(steady.W, 2))
-    slack = np.full(len(D), NEARLY_HARD * size)
-    weight = block_diag(np.zeros((n_x, n_x)), 2 * steady.W)
-    return _of_one_stage(n_x, weight, SCALE * size, (D, *sides), slack)
 
 
 def _of_one_stage(

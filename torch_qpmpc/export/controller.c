@@ -2,7 +2,7 @@
 #include "policy.h"
 
 /* An observer of e = [x; w], the state and constant disturbances; a QP for the steady state that is
-   nearest to the set-point, or two if that leaves inputs free; and a QP for the plan to it.
+   nearest to the set-point, solved again if that leaves inputs free; and a QP for the plan to it.
 
        e  is corrected by L_k (y - H e), and predicted by F e + G u + E d + OFFSET
        [x_s; u_s; y_s] = [X_V; U_V; Y_V] v + [X_L; U_L; Y_L] [w; known; 1], v by the target's QPs
@@ -281,13 +281,6 @@ static int aim(policy_state *s, const real r[], const real known[])
         for (i = 0; i < N_F; i++) t[i] = v[N_A + i] + move[i] * share / (1 - share);
         follows = !follows;
     }
-#if POLICY_FREE
-    if (code == POLICY_SOLVED) {
-        copy(t, v, N_A);
-        copy(t + N_A, loads, LOADS);
-        code = policy_free_step(&s->free, t, v + N_A, 0);
-    }
-#endif
     for (i = 0; i < N_X; i++) s->x_s[i] = 0;
     for (i = 0; i < N_U; i++) s->u_s[i] = 0;
     for (i = 0; i < N_Y; i++) s->y_s[i] = 0;
@@ -342,9 +335,6 @@ void policy_reset(policy_state *s, const real y[], const real u[], const real kn
     int i;
     policy_plan_reset(&s->plan);
     policy_target_reset(&s->target);
-#if POLICY_FREE
-    policy_free_reset(&s->free);
-#endif
 #if POLICY_CARRIES
     s->carried = 0;
 #endif
@@ -400,9 +390,6 @@ int policy_selftest(void)
     int i, j;
     if (policy_plan_selftest()) return 1;
     if (policy_target_selftest()) return 2;
-#if POLICY_FREE
-    if (policy_free_selftest()) return 2;
-#endif
     policy_reset(&state, 0, EXAMPLE_START[0], 0);
     for (i = 0; i < EXAMPLES; i++) {
         if (policy_step(&state, EXAMPLE_Y[i], EXAMPLE_R[i], EXAMPLE_KNOWN[i], u)) return 3 + i;

@@ -6,9 +6,6 @@
 
 #include "policy_plan.h"
 #include "policy_target.h"
-#if POLICY_FREE
-#include "policy_free.h"
-#endif
 
 #ifdef __cplusplus
 extern "C" {
@@ -37,9 +34,6 @@ typedef struct {
     policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
     policy_plan_state plan;
     policy_target_state target;
-#if POLICY_FREE
-    policy_free_state free;
-#endif
 #if POLICY_CARRIES
     policy_real P[POLICY_N_E][POLICY_N_E];       /* the covariance of e that is left after a missing output */
     int carried;                                 /* 1 while it is not the steady state's */
