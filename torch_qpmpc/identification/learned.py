@@ -3,8 +3,8 @@
 With v = [d; x; u] the change x_{k+1} - x_k and the stage cost l_k, if there is one, are the mean of
 an ensemble of networks of v_k (Chua et al., 2018, "Deep reinforcement learning in a handful of
 trials using probabilistic dynamics models"), or linear and convex quadratic in v_k. Each network is
-trained without a part of the log, and its error there decides. Networks of what the linear model
-leaves fit the log as well, and their sum with it is worse where the log is thin.
+trained without a part of the log, and its errors there decide for each entry. Networks of what the
+linear model leaves fit the log as well, and their sum with it is worse where the log is thin.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ from torch_qpmpc.identification.ridge import ridge
 
 #: The networks, their width, and the steps, rate and batch of their training.
 COUNT, WIDTH, STEPS, RATE, BATCH = 5, 64, 2500, 3e-3, 128
-#: Networks are used if they leave less than this share of the linear model's mean square of some
-#: output of which the linear model leaves more than the second share of the variance.
-LEFT, EXACT = 0.9, 1e-10
+#: A network predicts an entry if it leaves less than this share of the linear model's mean square,
+#: the cost of a nonlinear plant also near a tie with the quadratic; and none that the linear model
+#: leaves less of than this share of its variance.
+LEFT, TIED, EXACT = 0.9, 1.5, 1e-10
 
 
 class LearnedModel(nn.Module):
@@ -146,10 +147,13 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
         layers, error = _trained(v.float(), ((target - mean) / spread).float())
         left = torch.where(wanted, error * spread.square() / rest, 1.0)
         W_1, b_1, W_2, b_2, W_3, b_3 = (x.detach().double() for x in layers)
+        used = (left < torch.where(torch.arange(len(left)) < n_x, LEFT, TIED)) * (left < LEFT).any()
         first = W_1.movedim(0, 1).flatten(1), b_1.flatten()
-        last = (W_3 / COUNT).flatten(0, 1) * spread, b_3.mean((0, 1)) * spread + mean
-        layers = (*first, W_2, b_2, *last) if (left < LEFT).any() else ()
-        base = base * (not layers)
+        last = (
+            (W_3 / COUNT).flatten(0, 1) * spread * used,
+            (b_3.mean((0, 1)) * spread + mean) * used,
+        )
+        layers, base = (*first, W_2, b_2, *last) if used.any() else (), base * ~used
     return LearnedModel(middle, size, base, n_x, layers, left)
 
 
