@@ -31,7 +31,7 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 BUDGET = {
     ".": 415,
     "analysis": 851,
-    "control": 4713,
+    "control": 4712,
     "envs": 1432,
     "experiment": 2985,
     "export": 1515,

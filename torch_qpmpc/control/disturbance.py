@@ -245,6 +245,7 @@ class Steady:
             x, y, u = (of + basis @ F @ least @ off for of, basis in ((x, X), (y, Y), (u, U)))
             X, U, Y = X @ T, U @ T, Y @ T
             Y[:, -len(W) :][np.abs(Y[:, -len(W) :]) < RANK] = 0.0
+            U[np.abs(U) < RANK] = 0.0  # rounding would set the lengths of the target's QP
         X, x, U, u, Y, y = (
             size[:, None] * part
             for size, parts in ((sizes.x, (X, x)), (sizes.u, (U, u)), (sizes.y, (Y, y)))

@@ -132,11 +132,9 @@ def export_controller(
     dtype = options.get("dtype", "float64")
     mpc, known = law.mpc, last_known(law.design, memory)
     with tempfile.TemporaryDirectory() as temporary:
-        parts = {"plan": mpc.plan, "target": mpc.targets}
-        reports = plan, target = [
-            export_c(part, temporary, name=f"{name}_{key}", **options)
-            for key, part in parts.items()
-        ]
+        plan = export_c(mpc.plan, temporary, name=f"{name}_plan", **options)
+        target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
+        reports = plan, target
         texts = {x.name: x.read_text(encoding="utf-8") for part in reports for x in part.files}
     course = _course(law, known)
     start = course["u"]
