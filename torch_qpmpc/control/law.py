@@ -257,7 +257,8 @@ class Law:
 
     def check_runs(self, memory: Memory) -> None:
         """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
-        for i, (name, run) in enumerate(zip(self.design.plant.inputs, memory.runs, strict=True)):
+        runs: Any = memory.runs
+        for i, (name, run) in enumerate(zip(self.design.plant.inputs, runs, strict=True)):
             word, levels = "on" if run > 0 else "off", self.levels[i, np.isfinite(self.levels[i])]
             left = self.design.switching[f"min_{word}"][i] - abs(run) if len(levels) else 0
             if left > 0 and not ((levels > self.switches[i]) == (run > 0)).any():

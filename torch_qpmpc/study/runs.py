@@ -80,9 +80,9 @@ class FinishedRun:
         if begins or not self._last:
             x = kalman.first(y)
         else:
-            *last, k = self._last
+            x, u, known, k = self._last
             k += 1
-            x = kalman.following(*last, y, k)
+            x = kalman.following(x, u, known, y, k)
         u = torch.as_tensor(self.policy.predict(torch.cat((d, x), -1)))
         self._last = x, u, d[..., : model.E.shape[-1]], k
         return u.numpy()

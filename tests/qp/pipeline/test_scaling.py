@@ -138,8 +138,8 @@ def one_sided(seed: int, low: float, opposed: float | None = None, factor: Any =
 
 def solved(solver: str, w: float = torch.inf, **data: Tensor) -> tuple[QPSolution, float]:
     """Solve with hard rows; return the largest violation, relative to the terms of its row."""
-    data = {name: x.double() for name, x in data.items()}
-    qp = QuadraticProgram(**data, w=torch.full_like(data["ub"], w))
+    parts: Any = {name: x.double() for name, x in data.items()}
+    qp = QuadraticProgram(**parts, w=torch.full_like(parts["ub"], w))
     solution = solve_qp(qp, solver=solver, on_failure="mask")
     over = qp.G @ solution.z - qp.ub
     terms = qp.G.abs() @ solution.z.abs() + qp.ub.abs()
