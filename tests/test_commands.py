@@ -122,7 +122,7 @@ SHORT = {
     "python -m tests.benchmarks.closed_loops --seeds 16 17 18 19 20": Short(
         "--cases Gros-Zanon --seeds 71"
     ),
-    "python -m tests.benchmarks.violation": Short("--seeds 1 --steps 50", quick=True),
+    "python -m tests.benchmarks.violation": Short("--seeds 1 --steps 50"),
     "python -m tests.benchmarks.improvement": Short(
         "--cases 'Point mass, Brownian noise' --seeds 71"
     ),

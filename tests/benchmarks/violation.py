@@ -2,7 +2,7 @@
 
 ``python -m tests.benchmarks.violation`` identifies a heated tank from logs of 600 steps of each
 kind of noise, and holds a set-point beyond the upper bound for 300 steps of new noise. ``--write``
-puts the table into docs/results/conventions.md.
+puts the table into docs/results/conventions.md. Seeds 0 to 3 chose the step whose errors count.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch_qpmpc as qm
 
 KINDS = ("normal", "heavy-tailed", "coloured")
 SHARES = (None, 0.2, 0.05, 0.01)
-HORIZON, SETTLED, BOUND, BEYOND = 12, 50, 6.0, 7.0
+HORIZON, SETTLED, BOUND, BEYOND, FIRST = 12, 50, 6.0, 7.0, 100
 PAGE = Path(__file__).parents[2] / "docs/results/conventions.md"
 A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.2]]), np.array([[1.0, 0.0]])
 
@@ -66,10 +66,10 @@ def table(seeds: int, steps: int) -> str:
     for kind in KINDS:
         runs = np.zeros((seeds, len(SHARES), 2))
         for seed in range(seeds):
-            model = identified(kind, seed)
+            model = identified(kind, FIRST + seed)
             for i, share in enumerate(SHARES):
                 mpc = qm.LinearMPC(model, HORIZON, Q=1.0, dR=0.1, **bounds, violation=share)
-                runs[seed, i] = rate(qm.Controller(mpc), kind, seed, steps)
+                runs[seed, i] = rate(qm.Controller(mpc), kind, FIRST + seed, steps)
         wide = 196 * runs[..., 0].std(0) / np.sqrt(max(seeds - 1, 1))
         pairs = zip(100 * runs[..., 0].mean(0), wide, runs[..., 1].mean(0), strict=True)
         cells = " | ".join(f"{x:.1f}±{by:.1f}, {cost:.2f}" for x, by, cost in pairs)

@@ -231,7 +231,7 @@ class Controller:
             QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
         """
         law = self._law.redesigned(**changes)
-        law.check_runs(self._memory)
+        law.check_runs(self._memory.runs)
         self._law = ready(law)
         u = np.clip(self.u, *self.mpc.design.u_bounds)
         self._memory, self._now = self._memory._replace(u=u), None

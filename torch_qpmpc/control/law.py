@@ -255,9 +255,8 @@ class Law:
         lower, upper = (side[:, None] for side in self.design.u_bounds)
         return np.sort(np.where((lower <= own) & (own <= upper), own, np.inf))
 
-    def check_runs(self, memory: Memory) -> None:
+    def check_runs(self, runs: Any) -> None:
         """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
-        runs: Any = memory.runs
         for i, (name, run) in enumerate(zip(self.design.plant.inputs, runs, strict=True)):
             word, levels = "on" if run > 0 else "off", self.levels[i, np.isfinite(self.levels[i])]
             left = self.design.switching[f"min_{word}"][i] - abs(run) if len(levels) else 0
