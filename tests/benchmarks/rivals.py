@@ -245,7 +245,10 @@ def regulator(plant: Priced, found: Identified) -> Regulator:
             X, last = closed @ X @ closed.T + S[0, 0] * size * L @ L.T, X
             if abs(X - last).max() <= 1e-10 * abs(X).max():
                 break
-        std = (C @ X @ C.T).item() ** 0.5
+        grown = (C @ X @ C.T).item() ** 0.5
+        if not grown < 1e3 * S[0, 0] ** 0.5:  # no gain holds such noise in the mean square
+            break
+        std = grown
     return Regulator(K, v_s[:-1], float(v_s[-1]), std)
 
 
