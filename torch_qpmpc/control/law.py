@@ -386,13 +386,13 @@ class Law:
         if r is None and not len(last) and self.design.Q.any():
             want = f"set-points of {', '.join(outputs)}"
             raise QPError.expected("r", "None in the first step", want)
-        if r is None:
-            r = last if len(last) else np.zeros(len(outputs))
-        free = np.setdiff1d(np.arange(len(outputs)), self.design.weighted)
-        if isinstance(r, Mapping):
+        r = (last if len(last) else np.zeros(len(outputs))) if r is None else r
+        free = [i for i in range(len(outputs)) if i not in self.design.weighted]
+        if isinstance(r, Mapping) and free:
             r = {**dict.fromkeys([outputs[i] for i in free], 0.0), **r}
         table = self.read("r", r, rows, sane=sane)
-        table[:, free] = np.where(self._are_plausible(table, 0), table, 0.0)[:, free]
+        if free:
+            table[:, free] = np.where(self._are_plausible(table, 0), table, 0.0)[:, free]
         return table
 
     def read(self, name: str, value: Any, rows: int, least: int = 1, sane: bool = True) -> Array:
