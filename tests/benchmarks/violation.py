@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import torch_qpmpc as qm
+from torch_qpmpc.study.markdown import replaced, table
 
 KINDS = ("normal", "heavy-tailed", "coloured")
 SHARES = (None, 0.2, 0.05, 0.01)
@@ -55,13 +56,10 @@ def rate(controller: qm.Controller, kind: str, seed: int, steps: int) -> tuple[f
     return float((T > BOUND).mean()), float(((T - BEYOND) ** 2).mean())
 
 
-def table(seeds: int, steps: int) -> str:
+def rates(seeds: int, steps: int) -> str:
     """Return the table: the rate in % with its 95 % interval over the seeds, and the cost."""
-    asked = [f"{share:.0%} asked" for share in SHARES[1:]]
-    rows = [
-        f"| noise | {' | '.join(['none asked', *asked])} |",
-        "| --- |" + " ---: |" * len(SHARES),
-    ]
+    head = ["noise", "none asked", *(f"{share:.0%} asked" for share in SHARES[1:])]
+    rows: list[list[str]] = []
     bounds = {"y_bounds": (0.0, BOUND), "u_bounds": (0.0, 10.0)}
     for kind in KINDS:
         runs = np.zeros((seeds, len(SHARES), 2))
@@ -72,9 +70,8 @@ def table(seeds: int, steps: int) -> str:
                 runs[seed, i] = rate(qm.Controller(mpc), kind, FIRST + seed, steps)
         wide = 196 * runs[..., 0].std(0) / np.sqrt(max(seeds - 1, 1))
         pairs = zip(100 * runs[..., 0].mean(0), wide, runs[..., 1].mean(0), strict=True)
-        cells = " | ".join(f"{x:.1f}±{by:.1f}, {cost:.2f}" for x, by, cost in pairs)
-        rows.append(f"| {kind} | {cells} |")
-    return "\n".join(rows)
+        rows.append([kind, *(f"{x:.1f}±{by:.1f}, {cost:.2f}" for x, by, cost in pairs)])
+    return table(head, rows)
 
 
 def main() -> None:
@@ -84,13 +81,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    text = table(options.seeds, options.steps)
+    text = rates(options.seeds, options.steps)
     print(text)
     if options.write:
-        start, end = "<!-- violation -->", "<!-- /violation -->"
-        before, rest = PAGE.read_text(encoding="utf-8").split(start)
-        after = rest.split(end)[1]
-        PAGE.write_text(f"{before}{start}\n\n{text}\n\n{end}{after}", encoding="utf-8")
+        page = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(replaced(page, text, "violation"), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -338,6 +338,7 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
             y, reward, *_ = env.step(run.predict(y, begins=k == 0))
             costs.append(-float(reward))
         assert costs == pytest.approx(loop.costs[:, 0].tolist(), rel=1e-6, abs=1e-9)
+    assert repr(FinishedRun(tmp_path)) == f"<run {tmp_path}>", "without a run"
     with pytest.raises(QPError, match=r"observation: got shape \(4,\), expected shape"):
         run.predict(np.zeros(4))
     assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM

@@ -101,8 +101,7 @@ def batch_shape(tensors: Sequence[Tensor]) -> torch.Size:
     return broadcast(*(x.shape[: x.ndim - n] for x, n in zip(tensors, NDIMS, strict=True)))
 
 
-#: The default of a part that a QP need not have.
-ABSENT: Any = None
+ABSENT: Any = None  # the default of a part that a QP need not have
 
 
 @dataclass(frozen=True, repr=False)
@@ -188,16 +187,17 @@ class QuadraticProgram:
         return (self.H, self.q, self.c, self.C, self.b, self.G, self.lb, self.ub, self.w)
 
     def _fill(self) -> None:  # parts that are absent
-        given = dict(zip(EVENT_SHAPES, self.tensors(), strict=True))
-        if all(x is not None for x in given.values()) or not isinstance(self.H, Tensor):
+        H, G, given = self.H, self.G, self.tensors()
+        if all(x is not None for x in given) or not torch.is_tensor(H) or not H.is_floating_point():
             return
-        one, bound = self.H.new_ones(self.H.shape[-1:]), self.lb if self.ub is None else self.ub
-        G = one.diag()[: 0 if bound is None else None] if self.G is None else self.G
-        row = one.new_full(G.shape[-2:-1], torch.inf)
-        none = {"c": one.new_zeros(()), "C": one.diag()[:0], "b": one[:0], "G": G}
-        none |= {"lb": -row, "ub": row, "w": row}
-        for name in (x for x in none if given[x] is None):
-            object.__setattr__(self, name, none[name])
+        one = H.new_ones(H.shape[-1] if H.ndim else 0)
+        G = one.diag()[: 0 if self.lb is self.ub is None else None] if G is None else G
+        n_g = G.shape[-2] if isinstance(G, Tensor) and G.ndim > 1 else 0
+        row = one.new_full((n_g,), torch.inf)
+        none = (H, None, one.new_zeros(()), one.diag()[:0], one[:0], G, -row, row, row)
+        for name, x, absent in zip(EVENT_SHAPES, given, none, strict=True):
+            if x is None:
+                object.__setattr__(self, name, absent)
 
     def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):

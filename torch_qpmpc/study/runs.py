@@ -53,9 +53,12 @@ class FinishedRun:
 
     def __repr__(self) -> str:
         """Say which run it is, and its mean costs before and after learning."""
-        cfg, J = self.cfg, self.summary
-        case = f"task={cfg.task.name} constraint={cfg.constraint.name} seed={cfg.seed}"
-        return f"<run {self.folder}: {case}, J {J['J_start']:.4g} to {J['J_best']:.4g}>"
+        text = f"<run {self.folder}"
+        with contextlib.suppress(QPError, TypeError):  # unfinished, or a cost is null
+            cfg, J = self.cfg, self.summary
+            text += f": task={cfg.task.name} constraint={cfg.constraint.name} seed={cfg.seed}"
+            text += f", J {J['J_start']:.4g} to {J['J_best']:.4g}"
+        return f"{text}>"
 
     def predict(self, observation: Any, begins: bool = False) -> np.ndarray:
         """Return the learned policy's action ``(*batch, n_u)`` for the next observation.
@@ -73,18 +76,16 @@ class FinishedRun:
         """
         if self.observer is None:
             return self.policy.predict(observation)
-        split, model = self.policy.n_p - self.policy.n_x, self.observer
+        split, model, k = self.policy.n_p - self.policy.n_x, self.observer, 0
         p = torch.as_tensor(np.asarray(observation, float))
         d, y = check_tensor("observation", p, split + len(model.C)).tensor_split([split], -1)
-        kalman, k = KalmanFilter(model), 0
         if begins or not self._last:
-            x = kalman.first(y)
+            x = (kalman := KalmanFilter(model)).first(y)
         else:
-            x, u, known, k = self._last
-            k += 1
+            kalman, x, u, known, k = self._last
             x = kalman.following(x, u, known, y, k)
         u = torch.as_tensor(self.policy.predict(torch.cat((d, x), -1)))
-        self._last = x, u, d[..., : model.E.shape[-1]], k
+        self._last = kalman, x, u, d[..., : model.E.shape[-1]], k + 1
         return u.numpy()
 
     @cached_property
