@@ -38,7 +38,7 @@ from torch_qpmpc.experiment.algorithms import (
     make_run_replay,
     warm_up_batches,
 )
-from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.launch import (
@@ -61,7 +61,7 @@ from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import restore, snapshot
 from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.experiment.tasks.code import named_task
+from torch_qpmpc.experiment.tasks.code import named_task, run_code
 from torch_qpmpc.files import save_file
 from torch_qpmpc.mpc.state import KIND
 
@@ -70,7 +70,7 @@ CONFIGS = str(Path(__file__).with_name("configs"))
 
 
 def train(
-    cfg: DictConfig, folder: str, state: dict[str, Any] | None = None, quiet: bool = False
+    cfg: Config, folder: str, state: dict[str, Any] | None = None, quiet: bool = False
 ) -> dict[str, Any]:
     """Train from the beginning, or from the ``state`` of a checkpoint.
 
@@ -79,14 +79,13 @@ def train(
     Returns:
         The content of summary.json.
     """
-    check_config(cfg)
     interrupt = Interrupt()
     with contextlib.nullcontext() if quiet else interrupt:
         return _train(cfg, folder, state, quiet, interrupt)
 
 
 def _train(
-    cfg: DictConfig, folder: str, state: dict[str, Any] | None, quiet: bool, interrupt: Interrupt
+    cfg: Config, folder: str, state: dict[str, Any] | None, quiet: bool, interrupt: Interrupt
 ) -> dict[str, Any]:
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
@@ -213,9 +212,10 @@ def _train(
 def _run(cfg: DictConfig) -> float:
     """Train, and return the closed gap, which an optimising sweeper can maximise."""
     with launched() as (folder, sweep):
-        state, summary = settled(cfg, folder, sweep)
+        config = run_code(cfg)
+        state, summary = settled(config, folder, sweep)
         if summary is None:
-            summary = train(cfg, folder, state, quiet=sweep)
+            summary = train(config, folder, state, quiet=sweep)
         elif not sweep:
             print(f"\n{table(not_null(summary))}\n\n{folder}, which has finished before")
     return summary["closed_gap"]

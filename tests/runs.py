@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 import train
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import LinearSystem
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.tasks import make_physics, make_true_mpc
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -43,7 +44,12 @@ SMALL = (
 )
 
 
-def make_config(*overrides: str) -> DictConfig:
+def make_config(*overrides: str) -> Config:
+    """Make the configuration of overrides, the last one of a key counting."""
+    return Config.of(compose_config(*overrides))
+
+
+def compose_config(*overrides: str) -> DictConfig:
     """Compose configs/ with overrides; the last override of a key counts.
 
     Composing takes long: Hydra composes each choice of groups, and keys of its own, once, and then
@@ -98,14 +104,14 @@ def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
-def linear_system(cfg: DictConfig) -> LinearSystem:
+def linear_system(cfg: Config) -> LinearSystem:
     """Make a plant with a true model."""
     physics = make_physics(cfg)
     assert isinstance(physics, LinearSystem)
     return physics
 
 
-def true_mpc(cfg: DictConfig, physics: LinearSystem) -> QPMPC:
+def true_mpc(cfg: Config, physics: LinearSystem) -> QPMPC:
     """Make the MPC with the true model."""
     mpc = make_true_mpc(cfg, physics)
     assert mpc is not None

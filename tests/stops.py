@@ -9,17 +9,17 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from omegaconf import DictConfig
 
 import train
-from torch_qpmpc.experiment.config import load_config
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.launch import settled
+from torch_qpmpc.experiment.run_folder import read_config
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 
 def stop(
     monkeypatch: pytest.MonkeyPatch,
-    cfg: DictConfig,
+    cfg: Config,
     folder: Path,
     update: int,
     signum: int = signal.SIGTERM,
@@ -46,9 +46,9 @@ def stop(
     return ended.value.code
 
 
-def begun(folder: Path) -> tuple[DictConfig, dict[str, Any] | None]:
+def begun(folder: Path) -> tuple[Config, dict[str, Any] | None]:
     """Return the configuration and the state of a stopped run."""
-    cfg = load_config(folder / "config.yaml")
+    cfg = read_config(folder)
     state, summary = settled(cfg, folder, sweep=False)
     assert summary is None
     return cfg, state

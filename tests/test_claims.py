@@ -9,7 +9,6 @@ from tests.campaign.families import FAMILIES
 from tests.claims.__main__ import ROOT, load, main
 from tests.pages import PAGES, needs_docs
 from tests.runs import make_config
-from torch_qpmpc.experiment.config import check_config
 
 CLAIMS = load()
 
@@ -27,7 +26,7 @@ def test_pages_quote_what_the_claims_say(claim):
 def test_commands_of_claims_have_possible_settings():
     for claim in CLAIMS:
         for words in re.findall(r"python train.py (?!-m )([^&;]*)", claim.command):
-            check_config(make_config(*(word.strip("'") for word in words.split())))
+            make_config(*(word.strip("'") for word in words.split()))
     assert any(claim.quick for claim in CLAIMS)
 
 

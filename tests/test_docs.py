@@ -15,7 +15,6 @@ import pytest
 import torch_qpmpc
 from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
 from tests.runs import SMALL, ended, make_config
-from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.experiment.tasks.code import named_task
 from torch_qpmpc.proofs import invariant
@@ -81,7 +80,7 @@ def test_train_commands_have_possible_settings(command, monkeypatch):
     overrides = [word for word in command if word != "-m"]
     # Of a sweep, the first of each choice.
     first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
-    check_config(make_config(*named_task(first)))
+    make_config(*named_task(first))
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,8 @@ from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.experiment.config import NonNegative, Positive
 from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, plant_scheme, register
-from torch_qpmpc.experiment.tasks.registry import NonNegative, Positive
 from torch_qpmpc.mpc.riccati import riccati_weight
 
 STARTS = 256  # closed loops of an evaluation: costs under this noise have heavy tails

@@ -24,8 +24,8 @@ from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
+from torch_qpmpc.experiment.config import NonNegative
 from torch_qpmpc.experiment.tasks import Task, TaskSettings, plant_layout, priced, register
-from torch_qpmpc.experiment.tasks.registry import NonNegative
 from torch_qpmpc.mpc.layout import band_distance
 
 DT, DAY = 0.25, 96  # hours of a step, steps of a day

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 
 import train
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
@@ -67,7 +67,7 @@ CASES = {
 }
 
 
-def configuration(case: Case, seed: int) -> DictConfig:
+def configuration(case: Case, seed: int) -> Config:
     """Compose the configuration of a run."""
     cfg = make_config(*COMMON, *case.overrides, f"seed={seed}")
     cfg.eval_interval = cfg.updates
@@ -85,7 +85,7 @@ def fixed_costs(case: str) -> dict[str, float]:
     return {"other": other, "reference": np.nan if reference is None else J[reference]}
 
 
-def trained(case: Case, seed: int) -> tuple[DictConfig, int, dict[str, Any]]:
+def trained(case: Case, seed: int) -> tuple[Config, int, dict[str, Any]]:
     """Train once; return the configuration, the size of a log of its own, and the summary."""
     cfg, logged = configuration(case, seed), 0
     with tempfile.TemporaryDirectory() as folder:

@@ -33,18 +33,19 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 from scipy.optimize import linprog
 
 import train
 from tests.benchmarks.table import DOCS
-from tests.runs import make_config
+from tests.runs import compose_config
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import make_start
-from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics, run_code
+from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics
+from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.study.markdown import replaced, table
 
@@ -370,13 +371,13 @@ PLANTS = {
 }
 
 
-def configuration(name: str, seed: int, *overrides: str) -> DictConfig:
+def configuration(name: str, seed: int, *overrides: str) -> Config:
     """Compose the configuration of a plant's documented command."""
     plant = PLANTS[name]
     own = ("task=gymnasium", f"task.id={plant.id}", "start=data", f"seed={seed}")
-    cfg = make_config(*own, "figures=false", "logger=csv", *plant.overrides, *overrides)
-    run_code(cfg.task)
-    return cfg
+    return run_code(
+        compose_config(*own, "figures=false", "logger=csv", *plant.overrides, *overrides)
+    )
 
 
 def reference(plant: Outside) -> float:
@@ -430,7 +431,7 @@ def learned(name: str, seed: int, start: float) -> dict[str, Any]:
     return entries | {"transitions": 2 * cfg.start.transitions + steps}
 
 
-def _costs(cfg: DictConfig, physics: AnyPlant, policy: Any) -> torch.Tensor:
+def _costs(cfg: Config, physics: AnyPlant, policy: Any) -> torch.Tensor:
     """Return the costs of the episodes of an evaluation."""
     return evaluate(cfg, policy, physics, EVAL_SEED).costs.sum(0)
 

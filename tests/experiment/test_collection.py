@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 import torch
-from omegaconf import DictConfig
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, SolveLog
 from torch_qpmpc.experiment.algorithms import batches, make_collector
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
 NOISES = {"point_mass": "gaussian", "gros_zanon": "uniform", "pendulum": "none"}
 
 
-def collect(cfg: DictConfig, count: int) -> tuple[Any, Any]:
+def collect(cfg: Config, count: int) -> tuple[Any, Any]:
     """Collect ``count`` batches; return them and the policy's QP."""
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)

@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 import train
-from tests.runs import CONFIGS, SMALL, choices, make_config
+from tests.runs import CONFIGS, SMALL, choices, compose_config, make_config
 from tests.stops import assert_same_numbers, go_on
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import evaluation
@@ -186,7 +186,7 @@ def test_the_help_fits_on_two_screens_and_lists_every_choice():
 
 
 def test_the_helps_defaults_are_those_of_the_configuration():
-    cfg, text = make_config(), help_text()
+    cfg, text = compose_config(), help_text()
     settings = text[text.index("Keys\n") : text.index("All keys")].splitlines()[1:]
     shown = dict(line.split()[0].split("=", 1) for line in settings if line.strip())
     del shown["hydra.run.dir"]

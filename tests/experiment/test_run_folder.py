@@ -13,13 +13,12 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.run_folder import RunFolder, read_metrics, unwritable
+from torch_qpmpc.experiment.run_folder import RunFolder, read_config, read_metrics, unwritable
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "runs.md"
 
@@ -36,7 +35,7 @@ def test_folder_has_everything_logged(tmp_path, monkeypatch):
         assert run.column("eval/J") == ([100, 200, 300], [900.0, 800.0, 700.0])
         run.finish({"J_final": 700.0, "closed_gap": math.nan, "rivals": {"zero": math.inf}})
     folder = tmp_path / "run"
-    assert OmegaConf.load(folder / "config.yaml") == cfg
+    assert read_config(folder) == cfg
     table: Any = read_metrics(folder)
     assert list(table.index) == list(range(1, 301)), "one row for an update"
     assert list(table.columns) == ["loss/value", "train/reward", "eval/J"]

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch.testing import assert_close
 
 import train
 from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc import QPError
-from torch_qpmpc.experiment.config import check_config
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.gymnasium import given_scheme
@@ -41,8 +40,7 @@ def log_of(*settings: str) -> TensorDictBase:
     return _log(*settings).clone()
 
 
-def start_of(cfg: DictConfig):
-    check_config(cfg)
+def start_of(cfg: Config):
     physics: Any = make_physics(cfg)
     start = identified_start(cfg, physics, collect_log(cfg, physics))
     physics = start.plant(physics)
@@ -77,7 +75,7 @@ def test_infinite_bounds_cannot_be_explored():
 
 
 def test_a_log_is_of_the_runs_environments():
-    cfg = make_config(*DATA, "num_envs=3")
+    cfg = make_config(*DATA, "num_envs=3", "replay_capacity=300")
     log = collect_log(cfg, make_physics(cfg))
     assert log.shape == (3, 67)
     assert log.get(("next", "done")).sum(1).flatten().tolist() == [5, 5, 5], "episodes of 12 steps"

@@ -16,12 +16,19 @@ import torch
 from pydantic import Field
 
 import train
-from tests.runs import SMALL, composed, linear_system, make_config, run_command, true_mpc
+from tests.runs import (
+    SMALL,
+    compose_config,
+    composed,
+    linear_system,
+    make_config,
+    run_command,
+    true_mpc,
+)
 from tests.stops import assert_same_numbers, stop
 from torch_qpmpc import Cost, QPError
 from torch_qpmpc.envs import GrosZanonLTI, PointMass
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.config import check_config
 from torch_qpmpc.experiment.tasks import (
     TASKS,
     TaskSettings,
@@ -30,9 +37,8 @@ from torch_qpmpc.experiment.tasks import (
     make_physics,
     make_true_mpc,
     register,
-    run_code,
 )
-from torch_qpmpc.experiment.tasks.code import named_task
+from torch_qpmpc.experiment.tasks.code import named_task, run_code
 from torch_qpmpc.mpc.layout import banded_matrix
 
 
@@ -246,9 +252,9 @@ def own_task(tmp_path, monkeypatch):
 def test_a_registered_task_inherits_the_defaults_of_the_point_mass(own_task):
     file = own_task('defaults={"num_envs": 3, "task": {"horizon": 4}}')
     cfg = make_config("task=mine", "replay_capacity=300")
-    check_config(cfg)
     own = {"name": "mine", "file": file, "horizon": 4, "terminal_weight": "default"}
-    assert cfg.task == {**make_config().task, **own}, "all but the paper's terminal cost"
+    inherited = make_config().task.model_dump() | own
+    assert cfg.task.model_dump() == inherited, "all but the paper's terminal cost"
     assert (cfg.num_envs, cfg.noise.name) == (3, "none")
     assert make_config("task=mine", "task.horizon=5", "num_envs=2").task.horizon == 5
     physics = linear_system(cfg)
@@ -262,14 +268,13 @@ def test_another_process_finds_a_task_by_its_file(own_task):
     file = own_task("")
     del TASKS["mine"]
     with pytest.raises(QPError, match=r"task\.name: got 'mine', expected one of .*point_mass"):
-        find_task({"name": "mine"})
+        make_config("task=mine", "task.file=null")
     other = Path(file).with_suffix(".txt")
     other.write_text("")
     message = r"task\.file: got '.*mine.txt', which is no .py file, expected the Python file that"
     with pytest.raises(QPError, match=message):
-        run_code({"name": "mine", "file": str(other)})
-    run_code({"name": "mine", "file": file})
-    assert find_task({"name": "mine", "file": file}).name == "mine"
+        run_code(compose_config("task=mine", f"task.file={other}"))
+    assert find_task(run_code(compose_config("task=mine")).task).name == "mine"
 
 
 def test_the_command_line_may_name_a_script_alone(own_task, tmp_path):
@@ -287,7 +292,7 @@ def test_the_command_line_may_name_a_script_alone(own_task, tmp_path):
         named_task(["task.file=gone.py"])
     message = r"task\.file: got '.*mine\.py' with task=point_mass, which reads no file, exp"
     with pytest.raises(QPError, match=message):
-        run_code({"name": "point_mass", "file": file})
+        run_code(compose_config(f"task.file={file}"))
 
 
 def test_a_task_without_its_code_has_no_plant(own_task):
@@ -309,7 +314,7 @@ def test_an_environment_of_a_module_needs_its_import():
         r"task\.id: got 'greenhouse:Id-v0', and cannot import greenhouse \(No module .* Start "
     )
     with pytest.raises(QPError, match=message):
-        run_code(make_config("task=pendulum", "task.id=greenhouse:Id-v0").task)
+        run_code(compose_config("task=pendulum", "task.id=greenhouse:Id-v0"))
 
 
 def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
@@ -326,10 +331,9 @@ def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
 def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
     own_task('noises=("brownian", "gaussian"), takes_noise_std=True')
     cfg = make_config("task=mine", "noise.std=3")
-    check_config(cfg)
     assert cfg.noise.name == "brownian"
     with pytest.raises(QPError, match=r"noise\.name: got 'uniform', expected a noise of task mine"):
-        check_config(make_config("task=mine", "noise=uniform"))
+        make_config("task=mine", "noise=uniform")
 
     class Settings(TaskSettings):
         mass: float = Field(gt=0)
@@ -342,8 +346,9 @@ def test_a_task_has_noises_and_keys_of_its_own(own_task, tmp_path):
         (["+task.mas=1"], "task.mas: got an unknown key, .* Did you mean task.mass?"),
     ):
         with pytest.raises(QPError, match=message):
-            check_config(make_config("task=mine", *overrides))
-    check_config(make_config("task=mine", "+task.mass=1.5", "+task.colour=red"))
+            make_config("task=mine", *overrides)
+    cfg = make_config("task=mine", "+task.mass=1.5", "+task.colour=red")
+    assert (cfg.settings["task.mass"], cfg.settings["task.colour"]) == (1.5, "red")
 
 
 def test_invalid_registrations_are_refused(own_task):

@@ -16,7 +16,6 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 import train
 from tests.runs import CONFIGS, SMALL, make_config, run_command
@@ -26,7 +25,7 @@ from torch_qpmpc.envs import PointMass
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment import metrics as metrics_of_runs
 from torch_qpmpc.experiment.launch import LOCK, locked, same_command
-from torch_qpmpc.experiment.run_folder import read_metrics
+from torch_qpmpc.experiment.run_folder import read_config, read_metrics
 from torch_qpmpc.files import load_file
 from torch_qpmpc.mpc.layout import Layout, band_distance
 from torch_qpmpc.mpc.state import KIND
@@ -77,7 +76,7 @@ def test_folder_is_complete(whole):
     names = {"step": "cholesky", "seed": 5, "constraint": "combined", "noise": "gaussian"}
     assert {**summary, **names, "solver": "daqp", "updates": 30, "ablation": None} == summary
     assert 0 < summary["train_seconds"] < 600
-    assert OmegaConf.load(folder / "config.yaml") == make_config(*WHOLE)
+    assert read_config(folder) == make_config(*WHOLE)
     assert (folder / "summary.png").exists()
     assert (folder / "episode.png").exists()
     table = metrics(folder)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -16,8 +15,9 @@ from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
 
 from torch_qpmpc.envs.closed_loop import ClosedLoop
+from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.logs import without_blow_ups
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.identification.steps import valid_steps
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
@@ -73,7 +73,7 @@ def make_operator(mpc: QPMPC) -> QPActorValueOperator:
     return QPActorValueOperator(mpc, preview_key=preview_key(mpc), active_set_key=ACTIVE_SET)
 
 
-def make_learner(cfg: DictConfig, operator: QPActorValueOperator) -> Learner:
+def make_learner(cfg: Config, operator: QPActorValueOperator) -> Learner:
     """Make the learner of the operator's QP."""
     mpc = operator.module
     loss_module = QPQLearningLoss(operator, td_error_clip=cfg.td_error_clip, weighted=cfg.weighted)
@@ -95,17 +95,17 @@ def make_learner(cfg: DictConfig, operator: QPActorValueOperator) -> Learner:
 
 
 def make_penalties(
-    cfg: DictConfig, mpc: QPMPC
+    cfg: Config, mpc: QPMPC
 ) -> tuple[DeviationPenalty | None, SystemIdentificationPenalty | None]:
     """Make the deviation and the SI penalty; None for each that is off."""
-    deviation, si = cfg.constraint.deviation, cfg.constraint.si
+    own, si = cfg.constraint.deviation, cfg.constraint.si
     return (
-        None if deviation is None else DeviationPenalty(mpc, **deviation),
-        None if si is None else SystemIdentificationPenalty(si.beta),
+        own and DeviationPenalty(mpc, c_1=own.c_1, c_2=own.c_2, c_3=own.c_3),
+        si and SystemIdentificationPenalty(si.beta),
     )
 
 
-def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
+def make_optimizer(cfg: Config, mpc: QPMPC) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints."""
     options = cfg.optimizer
     if options.name == "gauss_newton":
@@ -124,15 +124,14 @@ def make_optimizer(cfg: DictConfig, mpc: QPMPC) -> torch.optim.Optimizer:
     return torch.optim.SGD(groups)
 
 
-def make_scheduler(cfg: DictConfig, optimizer: torch.optim.Optimizer) -> LambdaLR:
+def make_scheduler(cfg: Config, optimizer: torch.optim.Optimizer) -> LambdaLR:
     """Make the linear decay of the learning rates."""
-    # Read once: OmegaConf's lookups are slower than the function itself.
     last, updates = cfg.optimizer.final_fraction, cfg.updates
     return LambdaLR(optimizer, lambda k: 1 - (1 - last) * min(k / updates, 1))
 
 
 def evaluate(
-    cfg: DictConfig,
+    cfg: Config,
     policy: Callable[[Tensor], Tensor],
     physics: AnyPlant,
     seed: int | None = None,
@@ -145,7 +144,7 @@ def evaluate(
     )
 
 
-def make_collector(cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBase) -> Collector:
+def make_collector(cfg: Config, physics: AnyPlant, actor: TensorDictModuleBase) -> Collector:
     """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration."""
     env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
     exploration = AdditiveGaussianModule(
@@ -157,7 +156,7 @@ def make_collector(cfg: DictConfig, physics: AnyPlant, actor: TensorDictModuleBa
     return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **options)
 
 
-def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
+def make_run_replay(cfg: Config, mpc: QPMPC) -> Replay:
     """Make a run's replay of transitions and, for the SI penalty, of windows."""
     si = cfg.constraint.si
     return Replay(
@@ -172,7 +171,7 @@ def make_run_replay(cfg: DictConfig, mpc: QPMPC) -> Replay:
     )
 
 
-def warm_up_batches(cfg: DictConfig) -> int:
+def warm_up_batches(cfg: Config) -> int:
     """Return the number of batches, of ``steps_per_update`` steps each, of a run's warm-up."""
     return -(-cfg.warmup_steps // cfg.steps_per_update)
 

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple, Self
 
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 from scipy.special import stdtrit
 from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.logs import below
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
@@ -104,7 +104,7 @@ class Choice(NamedTuple):
         return choice
 
 
-def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]:
+def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
     """Return at most three starts of a log by name.
 
     They are MPC of the estimate and of the outputs, each with the regulator's cost of x_N, and, at
@@ -127,7 +127,7 @@ def candidates(cfg: DictConfig, physics: AnyPlant, log: Any) -> dict[str, Start]
 
 
 def choose(
-    cfg: DictConfig,
+    cfg: Config,
     physics: AnyPlant,
     log: Any,
     explored: Callable[[Start], TensorDictBase],
@@ -188,7 +188,7 @@ def choose(
     return choice.of(named[best], physics), log
 
 
-def chosen_before(cfg: DictConfig, physics: AnyPlant, log: TensorDictBase, folder: Path) -> Start:
+def chosen_before(cfg: Config, physics: AnyPlant, log: TensorDictBase, folder: Path) -> Start:
     """Return the start that the run in ``folder`` has chosen from its logs."""
     choice = Choice.read(folder)
     first = choice.scheme.endswith(FIRST)

@@ -1,4 +1,4 @@
-"""A run's configuration: its keys, the checks across them, loading and comparing."""
+"""A run's configuration: its keys, the checks across them, and their names."""
 
 from __future__ import annotations
 
@@ -6,36 +6,92 @@ import difflib
 import functools
 import importlib.util
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, get_args
 
 from omegaconf import DictConfig, OmegaConf
 from pydantic import (
     AfterValidator,
     BaseModel,
+    ConfigDict,
     Field,
     PlainValidator,
+    SerializeAsAny,
     ValidationError,
     model_validator,
 )
 
 from torch_qpmpc.errors import QPError, printable
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.tasks import TASKS, TaskSettings, find_task
-from torch_qpmpc.experiment.tasks.registry import (
-    Count,
-    Fraction,
-    Group,
-    NonNegative,
-    Positive,
-    Whole,
-)
-from torch_qpmpc.files import damaged
 from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.qp.solvers import backend
 
+if TYPE_CHECKING:
+    from torch_qpmpc.experiment.tasks.registry import Task
+
+#: All registered tasks by name.
+TASKS: dict[str, Task] = {}
+
+
+class Group(BaseModel):
+    """A group of keys that forbids unknown keys, converts no values, and takes finite numbers."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def _equally_long(rows: list[list[float]]) -> list[list[float]]:
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
+        raise ValueError("rows should be equally long")
+    return rows
+
+
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Beta = Annotated[float, Field(ge=0, lt=1)]
+Whole = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
+#: Weight of a slack; inf makes the row hard.
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=True)]
+Matrix = Annotated[list[list[float]], AfterValidator(_equally_long)]
+
+
+class TaskSettings(Group):
+    """The keys under ``task`` that all tasks share."""
+
+    name: str
+    #: The script that registers a user's task.
+    file: str | None = None
+    horizon: Count
+    gamma: Fraction
+    episode_steps: Count
+    eval_steps: Count
+    hessian: Literal["diagonal", "block"]
+    terminal_weight: Literal["default", "identity", "riccati"]
+    learn_cost: list[Literal["H", "H_f", "q", "c", "w"]]
+    state_slack: Weight
+    action_slack: Weight
+    discount_slack: bool
+    #: Episodes by which a start from data is chosen; 0 for the run's own start.
+    start_episodes: Whole = 0
+
+    @property
+    def modules(self) -> list[str]:
+        """The importable modules that the keys name."""
+        return []
+
+    @model_validator(mode="after")
+    def riccati_is_dense(self) -> Self:
+        if self.terminal_weight == "riccati" and self.hessian == "diagonal":
+            remedy = "The Riccati weight needs task.hessian=block."
+            raise QPError.expected(
+                "task.terminal_weight", "'riccati'", "default or identity", remedy
+            )
+        return self
+
+
+class UnreadSettings(TaskSettings, extra="allow"):
+    """The keys of a task whose script has not run, without checks."""
 
 
 class Noise(Group):
@@ -110,7 +166,22 @@ def _installed_logger(name: str) -> str:
 def _settings_of_the_task(value: Any) -> TaskSettings:
     if not isinstance(value, Mapping):
         raise QPError.expected("task", repr(value), "its keys, as in configs/task/")
-    return find_task(value).settings.model_validate(value)
+    unread = UnreadSettings.model_construct(**{"name": None, **value})
+    if unread.file is not None and unread.name not in TASKS:
+        return unread
+    return find_task(unread).settings.model_validate(value)
+
+
+def find_task(settings: TaskSettings) -> Task:
+    """Find a task by its settings; raise `QPError` if its script has not run."""
+    name, file = settings.name, settings.file
+    if name in TASKS:
+        return TASKS[name]
+    if file is None:
+        raise QPError.expected("task.name", repr(name), f"one of {', '.join(TASKS)}")
+    remedy = "Name it on the command line with task.file=FILE, or run it before."
+    want = f"a script that has registered {name!r}"
+    raise QPError.expected("task.file", f"{file!r}, which has not run", want, remedy)
 
 
 class Config(Group):
@@ -145,10 +216,30 @@ class Config(Group):
     eval_interval: Count
     log_interval: Count
     start: Annotated[FromModel | FromData, Field(discriminator="name")]
-    task: Annotated[TaskSettings, PlainValidator(_settings_of_the_task)]
+    task: Annotated[SerializeAsAny[TaskSettings], PlainValidator(_settings_of_the_task)]
     noise: Noise
     constraint: Constraint
     optimizer: Annotated[Adam | SGD | GaussNewton, Field(discriminator="name")]
+
+    @classmethod
+    def of(cls, cfg: DictConfig | Mapping[str, Any]) -> Self:
+        """Read Hydra's configuration or the settings of a saved one.
+
+        Raises:
+            QPError: names the first unknown key, missing key or invalid value.
+        """
+        tree = OmegaConf.to_container(cfg, resolve=True) if isinstance(cfg, DictConfig) else cfg
+        try:
+            return cls.model_validate(tree)
+        except ValidationError as error:
+            # A misspelt key is also a missing one.
+            first = min(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
+            raise _named(first) from None
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every setting that was given, by its dotted key."""
+        return flatten(self.model_dump(exclude_unset=True))
 
     def conflict(self, key: str, expected: str, remedy: str = "") -> NoReturn:
         """Raise the error of a value that conflicts with others."""
@@ -157,6 +248,8 @@ class Config(Group):
 
     @model_validator(mode="after")
     def values_fit(self) -> Self:
+        if isinstance(self.task, UnreadSettings):
+            return self
         part, tied = self.constraint, self.constraint.structure != "free"
         if not part.learn and not self.task.learn_cost:
             self.conflict("task.learn_cost", "something to learn, here or in constraint.learn")
@@ -180,7 +273,7 @@ class Config(Group):
         if part.si and not self.replay:
             remedy = "constraint.si samples from the replay; constraint=deviation has no si."
             self.conflict("replay", "true", remedy)
-        task = find_task(self.task.model_dump())
+        task = find_task(self.task)
         if self.noise.name not in task.noises:
             self.conflict("noise.name", f"a noise of task {task.name}: {', '.join(task.noises)}")
         if self.noise.std is not None and not task.takes_noise_std:
@@ -192,30 +285,20 @@ class Config(Group):
         return self
 
 
-def check_config(cfg: DictConfig) -> None:
-    """Raise `QPError` on the first unknown key, missing key or invalid value of ``cfg``."""
-    try:
-        Config.model_validate(OmegaConf.to_container(cfg, resolve=True))
-    except ValidationError as error:
-        # A misspelt key is also a missing one.
-        first = min(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
-        raise _named(first) from None
-
-
 def _named(error: Any) -> QPError:
     """Make the error of a key, in pydantic's words."""
-    kind, value, path = error["type"], error["input"], error["loc"]
+    kind, value, path = error["type"], error["input"], [*map(str, error["loc"])]
     if kind == "value_error" and isinstance(error["ctx"]["error"], QPError):
         return error["ctx"]["error"]
-    if len(path) > 1 and Config.model_fields[path[0]].discriminator:
-        path = path[:1] + path[2:]  # pydantic inserts the name of the choice
-    key = ".".join(map(str, path))
+    # pydantic's path also has choices, entries of lists, and types of unions.
+    known, key = {*keys()}, path[0]
+    for i, part in enumerate(path[1:], 2):
+        longer, unknown = f"{key}.{part}", kind == "extra_forbidden" and i == len(path)
+        key = longer if unknown or any(f"{x}.".startswith(f"{longer}.") for x in known) else key
     if kind == "extra_forbidden":
         return unknown_key(next(iter(flatten(value, key)), key))
     if kind.startswith("union_tag"):
         key, value = f"{key}.name", value.get("name")
-    # Of a list or a union, pydantic names the entry or the type, too.
-    key = next((known for known in keys() if key.startswith(f"{known}.")), key)
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
     words = f"{error['msg'][:1].lower()}{error['msg'][1:]}"
     return QPError(printable(f"{key}: got {got}, but {words}."))
@@ -246,35 +329,6 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
         return {prefix: tree}
     pairs = (flatten(value, f"{prefix}.{key}".lstrip(".")) for key, value in tree.items())
     return {key: value for pair in pairs for key, value in pair.items()}
-
-
-def load_config(file: Path) -> DictConfig:
-    """Load a run's saved configuration as plain values."""
-    try:
-        cfg = OmegaConf.load(file)
-        tree = OmegaConf.to_container(cfg, resolve=False)
-        if not isinstance(cfg, DictConfig) or not isinstance(tree, dict):
-            raise ValueError("it is a list")
-        for key, info in Config.model_fields.items():
-            if info.is_required() and key not in tree:
-                raise KeyError(key)
-        if not isinstance(tree["task"], dict):
-            raise ValueError("its task is not a mapping")
-    except Exception as error:  # damaged files raise errors of any type
-        raise damaged(file, error, "the configuration that a run wrote") from error
-    for key in [key for key in tree if key not in Config.model_fields and tree[key] is None]:
-        del cfg[key]  # of an earlier version, and off
-    for key, value in flatten(tree).items():
-        if isinstance(value, list | str) and "${" in str(value):
-            remedy = "Interpolations of a saved configuration are not resolved: write the value."
-            got = f"{key}={value!r} in {file}"
-            raise QPError.expected("config.yaml", got, "values, as train.py writes them", remedy)
-    return cfg
-
-
-def settings(cfg: DictConfig) -> dict[str, Any]:
-    """Return every setting by its dotted key."""
-    return flatten(OmegaConf.to_container(cfg, resolve=True))
 
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
@@ -20,8 +19,9 @@ from tqdm import tqdm
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.errors import QPError, printable
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, Policy
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_true_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, make_true_mpc
 from torch_qpmpc.experiment.tasks.identified import nominal_mpcs
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
@@ -75,16 +75,14 @@ class Evaluation:
         missing: why the end of the run lacks a rival or a figure, by name.
     """
 
-    cfg: DictConfig
+    cfg: Config
     physics: AnyPlant
     loops: dict[str, ClosedLoop]
     rivals: dict[str, float]
     missing: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def before(
-        cls, cfg: DictConfig, physics: AnyPlant, mpc: QPMPC, quiet: bool = True
-    ) -> Evaluation:
+    def before(cls, cfg: Config, physics: AnyPlant, mpc: QPMPC, quiet: bool = True) -> Evaluation:
         """Evaluate before learning, when ``mpc`` is the start and what has been learned."""
         policies: dict[str, Callable[[], Policy]] = {"start": lambda: warm_policy(mpc)}
         if (true_mpc := make_true_mpc(cfg, physics)) is not None:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.run_folder import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
@@ -41,7 +41,7 @@ class RunGate:
         compared: the number of transitions in closed loops of comparisons.
     """
 
-    def __init__(self, cfg: DictConfig, learner: Learner, physics: AnyPlant) -> None:
+    def __init__(self, cfg: Config, learner: Learner, physics: AnyPlant) -> None:
         self._cfg, self._learner, self._physics = cfg, learner, physics
         self._interval = cfg.gate_interval or cfg.eval_interval
         options = {

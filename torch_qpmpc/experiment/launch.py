@@ -20,24 +20,17 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.config import (
-    check_config,
-    differences,
-    keys,
-    load_config,
-    settings,
-    unknown_key,
-)
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, read_summary, unwritable
+from torch_qpmpc.experiment.config import Config, differences, keys, unknown_key
+from torch_qpmpc.experiment.run_folder import CHECKPOINT, read_config, read_summary, unwritable
 from torch_qpmpc.experiment.run_state import load_state
-from torch_qpmpc.experiment.tasks.code import COMMAND, run_code
+from torch_qpmpc.experiment.tasks.code import COMMAND
 
 #: The locked file of a run's folder.
 LOCK = ".lock"
 
 
 def settled(
-    cfg: DictConfig, folder: str | Path, sweep: bool
+    cfg: Config, folder: str | Path, sweep: bool
 ) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """Decide between a new run in ``folder``, one that goes on, and a finished one.
 
@@ -45,10 +38,8 @@ def settled(
         The state to go on from, or None; the summary of a finished run, or None.
 
     Raises:
-        QPError: the configuration is invalid, or the folder holds a run with another one.
+        QPError: the folder holds a run with another configuration.
     """
-    run_code(cfg.task)
-    check_config(cfg)
     folder = Path(folder)
     config, remedy = folder / "config.yaml", f"Choose another folder with {_key(sweep)}=FOLDER."
     if not config.exists():
@@ -56,7 +47,7 @@ def settled(
             got = f"{folder}, which holds a run without its config.yaml"
             raise QPError.expected("folder", got, "a run's folder, or one without a run", remedy)
         return None, None
-    if changed := differences(settings(load_config(config)), settings(cfg)):
+    if changed := differences(read_config(folder).settings, cfg.settings):
         then, now = changed
         raise QPError.expected("folder", f"{folder}, which holds a run with {then}", now, remedy)
     if (folder / "summary.json").exists():

@@ -9,14 +9,13 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from omegaconf import DictConfig
 from torch import Tensor
 
 from torch_qpmpc.analysis.plots import COLOURS, draw_matrix, episode_figure, plans_along
 from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.algorithms import warm_up_batches
+from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.evaluation import Evaluation, cost_text
-from torch_qpmpc.experiment.tasks import find_task
 from torch_qpmpc.mpc.module import QPMPC
 
 #: Starts whose paths are drawn.
@@ -110,7 +109,7 @@ def scale_costs(axes: Axes) -> None:
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def experience(cfg: DictConfig) -> tuple[int, int]:
+def experience(cfg: Config) -> tuple[int, int]:
     """Return the transitions before the first update, log included, and those of each."""
     each = cfg.num_envs * cfg.steps_per_update
     first = each * warm_up_batches(cfg)

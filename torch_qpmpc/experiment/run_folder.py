@@ -11,26 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torchrl.record.loggers import Logger, get_logger
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.config import load_config, settings
+from torch_qpmpc.experiment.config import Config, flatten
 from torch_qpmpc.files import damaged, write_whole
-from torch_qpmpc.mpc.module import QPMPC
 
 #: The newest state of a run in its folder.
 CHECKPOINT = "checkpoint.pt"
 #: The policy that the gate keeps, written by `QPMPC.save`.
 BEST = "best.pt"
-
-
-def learned_qp(folder: str | Path) -> QPMPC:
-    """Load the QP that the run in ``folder`` has learned and, with a gate, kept."""
-    cfg = load_config(Path(folder) / "config.yaml")
-    return QPMPC.load(Path(folder) / (BEST if cfg.gate else CHECKPOINT))
-
-
 #: Entries of summary.json that are numbers or, if they are not finite, null.
 NUMBERS = ("seed", "closed_gap", "J_start", "J_best", "J_final", "J_true_model")
 NUMBERS += ("canonical_distance",)
@@ -43,7 +34,7 @@ class RunFolder:
     the update ``after``, None in a new one; `QPError` where they are damaged.
     """
 
-    def __init__(self, folder: str | Path, cfg: DictConfig, after: int | None = None) -> None:
+    def __init__(self, folder: str | Path, cfg: Config, after: int | None = None) -> None:
         # Absolute, so that changes of the working directory do not affect the event writer.
         self.path = Path(folder).resolve()
         self.path.mkdir(parents=True, exist_ok=True)
@@ -52,7 +43,7 @@ class RunFolder:
         self.rows: list[dict[str, float]] = [{"update": k, **row.dropna()} for k, row in earlier]
         self.cfg = cfg
         if after is None:
-            text = OmegaConf.to_yaml(cfg, resolve=True)
+            text = OmegaConf.to_yaml(cfg.model_dump(exclude_unset=True))
             write_whole(self.path / "config.yaml", text.encode())
         self.logger = make_logger(cfg, self.path)
 
@@ -96,7 +87,7 @@ class RunFolder:
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
 
-def make_logger(cfg: DictConfig, folder: Path) -> Logger:
+def make_logger(cfg: Config, folder: Path) -> Logger:
     """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
     name = cfg.logger
     if name == "mlflow":  # its default, a database, needs more packages
@@ -105,8 +96,24 @@ def make_logger(cfg: DictConfig, folder: Path) -> Logger:
     logger = get_logger(name, str(place), folder.name if name == "wandb" else name)
     assert logger is not None
     if name != "tensorboard":  # whose hyper-parameters begin a folder of their own
-        logger.log_hparams({key: str(value) for key, value in settings(cfg).items()})
+        logger.log_hparams({key: str(value) for key, value in cfg.settings.items()})
     return logger
+
+
+def read_config(folder: str | Path) -> Config:
+    """Read a run's config.yaml; `QPError` if it is damaged or of another version."""
+    file = Path(folder) / "config.yaml"
+    try:
+        tree: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+        if not isinstance(tree, dict):
+            raise ValueError("it is a list")
+        if key := next((key for key, x in flatten(tree).items() if "${" in str(x)), None):
+            raise ValueError(f"{key} is an interpolation: write its value")
+        known = Config.model_fields
+        # A null key of an earlier version was off.
+        return Config.of({key: x for key, x in tree.items() if key in known or x is not None})
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(file, error, "the configuration that a run of this version wrote") from error
 
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:

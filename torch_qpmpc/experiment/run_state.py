@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
@@ -20,7 +19,7 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.config import differences, settings
+from torch_qpmpc.experiment.config import Config, differences
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
@@ -31,7 +30,7 @@ from torch_qpmpc.mpc.state import KIND, stored
 
 
 def snapshot(
-    cfg: DictConfig,
+    cfg: Config,
     mpc: QPMPC,
     learner: Learner,
     gate: RunGate,
@@ -45,7 +44,7 @@ def snapshot(
     """
     finished = tally.update == cfg.updates
     return {
-        "config": settings(cfg),
+        "config": cfg.settings,
         "update": tally.update,
         **stored(mpc),  # so that QPMPC.load reads a checkpoint, too
         "loss_module": learner.loss_module.state_dict(),
@@ -93,7 +92,7 @@ def restore(
     return tally
 
 
-def load_state(folder: Path, cfg: DictConfig) -> dict[str, Any]:
+def load_state(folder: Path, cfg: Config) -> dict[str, Any]:
     """Load the last `snapshot` of the run in a folder, which has the configuration ``cfg``.
 
     Raises:
@@ -102,7 +101,7 @@ def load_state(folder: Path, cfg: DictConfig) -> dict[str, Any]:
     state = load_file(folder / CHECKPOINT, KIND, "train.py")
     if "config" not in state:
         raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
-    if changed := differences(state["config"], settings(cfg)):
+    if changed := differences(state["config"], cfg.settings):
         then, now = changed
         remedy = "A run resumes with its own configuration, from its own checkpoints."
         raise QPError.expected(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.choosing import choose, chosen_before
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
@@ -69,7 +69,7 @@ class Exploration(nn.Module):
 
 
 def make_start(
-    cfg: DictConfig, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
+    cfg: Config, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
 ) -> Start | None:
     """Identify the start of a run from a log of the plant; None with ``start=model``.
 
@@ -85,7 +85,7 @@ def make_start(
         log = stored_log(Path(cfg.start.file))
     else:
         log = collect_log(cfg, physics)
-    if not cfg.task.get("start_episodes"):
+    if not cfg.task.start_episodes:
         start = identified_start(cfg, physics, log)
     elif written:
         start = chosen_before(cfg, physics, log, path.parent)
@@ -106,7 +106,7 @@ def make_start(
     return start
 
 
-def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
+def learning_start(cfg: Config, start: Start | None) -> Start | None:
     """Return the start that learning begins with: where one holds an action, that of the scheme.
 
     The gate keeps the action. Without a gate what is learned is kept, from the action on.
@@ -117,7 +117,7 @@ def learning_start(cfg: DictConfig, start: Start | None) -> Start | None:
 
 
 @torch.no_grad()
-def collect_log(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> TensorDict:
+def collect_log(cfg: Config, physics: AnyPlant, start: Start | None = None) -> TensorDict:
     """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments.
 
     With a ``start``, its policy acts, and `MIXED` times the exploration is added. The observations

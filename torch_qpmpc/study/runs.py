@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from omegaconf import DictConfig
 
 from torch_qpmpc.analysis.structure import (
     NearestModel,
@@ -27,8 +26,15 @@ from torch_qpmpc.analysis.structure import (
 from torch_qpmpc.checks import check_tensor
 from torch_qpmpc.envs import KalmanFilter, LinearSystem
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.config import check_config, load_config, settings
-from torch_qpmpc.experiment.run_folder import NUMBERS, learned_qp, read_metrics, read_summary
+from torch_qpmpc.experiment.config import Config
+from torch_qpmpc.experiment.run_folder import (
+    BEST,
+    CHECKPOINT,
+    NUMBERS,
+    read_config,
+    read_metrics,
+    read_summary,
+)
 from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.code import has_run
@@ -89,16 +95,9 @@ class FinishedRun:
         return u.numpy()
 
     @cached_property
-    def cfg(self) -> DictConfig:
-        """The run's configuration; `QPError` if it does not match this version's configs/."""
-        cfg = load_config(self.folder / "config.yaml")
-        try:
-            if has_run(cfg.task):
-                check_config(cfg)
-        except QPError as error:
-            got, remedy = f"a run with other keys ({error})", "Repeat it, or move it elsewhere."
-            raise QPError.expected(str(self.folder), got, "a run of this version", remedy) from None
-        return cfg
+    def cfg(self) -> Config:
+        """The run's configuration."""
+        return read_config(self.folder)
 
     @property
     def has_plant(self) -> bool:
@@ -108,10 +107,8 @@ class FinishedRun:
     @cached_property
     def physics(self) -> AnyPlant:
         """The plant, if `has_plant`."""
-        plant, observer = make_physics(self.cfg), self.observer
-        if observer is None or isinstance(plant, LinearSystem):
-            return plant
-        return plant.observed(observer)
+        plant = make_physics(self.cfg)
+        return plant if isinstance(plant, LinearSystem) else plant.observed(self.observer)
 
     @cached_property
     def observer(self) -> Innovations | None:
@@ -131,7 +128,7 @@ class FinishedRun:
     @cached_property
     def policy(self) -> QPMPC:
         """The learned policy, which the run has kept."""
-        return learned_qp(self.folder)
+        return QPMPC.load(self.folder / (BEST if self.cfg.gate else CHECKPOINT))
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -194,7 +191,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for file in sorted(folder.rglob("summary.json")):
         run = FinishedRun(file.parent)
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
-        names: dict[str, Any] = {name: run.cfg[name].name for name in ("constraint", "noise")}
+        names: dict[str, Any] = {"constraint": run.cfg.constraint.name, "noise": run.cfg.noise.name}
         names |= {"seed": run.cfg.seed, "ablation": run.cfg.ablation, "run": run}
         names["sweep"] = folder.resolve().name if where == "." else where
         rows.append({**run.summary, **names, **run.readings()})
@@ -216,7 +213,9 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
 def _labels(sweep: pd.DataFrame) -> list[str]:
     """Name each run by its case, and by its ablation or the settings that vary within its case."""
-    flat = [{key: str(x) for key, x in settings(run.cfg).items()} for run in sweep["run"]]
+    text = {float: "{:g}".format}
+    settings = [run.cfg.settings.items() for run in sweep["run"]]
+    flat = [{key: text.get(type(x), str)(x) for key, x in own} for own in settings]
     keys = pd.DataFrame(flat, index=sweep.index)
     keys = keys[[x for x in keys if x not in _UNLABELLED and not x.startswith("noise.")]]
     varied = keys.groupby(sweep["constraint"]).nunique() > 1

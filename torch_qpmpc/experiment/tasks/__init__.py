@@ -8,19 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
-from omegaconf import DictConfig
-
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings, find_task
 from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
 from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
-    TASKS,
     AnyPlant,
     Task,
-    TaskSettings,
-    find_task,
-    learned_parts,
     plant_layout,
     plant_scheme,
     priced,
@@ -47,30 +42,31 @@ __all__ = [
 ]
 
 
-def make_physics(cfg: DictConfig) -> AnyPlant:
+def make_physics(cfg: Config) -> AnyPlant:
     """Make the plant of the run's task."""
     return find_task(cfg.task).make_plant(cfg)
 
 
-def make_mpc(cfg: DictConfig, physics: AnyPlant, start: Start | None = None) -> QPMPC:
+def make_mpc(cfg: Config, physics: AnyPlant, start: Start | None = None) -> QPMPC:
     """Make the QP that learns, from the task's wrong scheme or, if there is one, from ``start``."""
     task = find_task(cfg.task)
     scheme = task.wrong_scheme(cfg, physics)
     if start is not None:
         scheme = identified_scheme(cfg, scheme, start)
     masks = task.masks(cfg, physics)
-    learn = {part: masks.get(part, True) for part in learned_parts(cfg)}
+    learned = (*cfg.task.learn_cost, *cfg.constraint.learn)
+    learn = {part: masks.get(part, True) for part in learned}
     return _make(cfg, scheme, learn, None if start is None else start.blended)
 
 
-def make_true_mpc(cfg: DictConfig, physics: AnyPlant) -> QPMPC | None:
+def make_true_mpc(cfg: Config, physics: AnyPlant) -> QPMPC | None:
     """Make the same QP with the true model, cost and bounds; None if they are unknown."""
     true_scheme = find_task(cfg.task).true_scheme
     return None if true_scheme is None else _make(cfg, true_scheme(cfg, physics), ())
 
 
 def _make(
-    cfg: DictConfig,
+    cfg: Config,
     scheme: Scheme,
     learn: Collection[str],
     schedule: BlendedModel | None = None,

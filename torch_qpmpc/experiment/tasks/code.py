@@ -6,38 +6,34 @@ A configuration from a run's folder is data: its code runs only if the command l
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import re
 import runpy
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.tasks.registry import TASKS
+from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings
 from torch_qpmpc.files import PACKAGED
 
-
-def modules(task: Mapping[str, Any]) -> list[str]:
-    """Return the importable modules that a Gymnasium environment's id and arguments name."""
-    if task.get("name") != "gymnasium":
-        return []
-    names = [text.partition(":")[0] for text in _strings([task.get("id"), task.get("kwargs")])]
-    return [name for name in names if _is_module(name)]
+#: How train.py is started: by its path in a clone, and as a module from a wheel.
+COMMAND = "python -m torch_qpmpc.train" if PACKAGED.exists() else "python train.py"
 
 
-def has_run(task: Mapping[str, Any]) -> bool:
+def has_run(task: TaskSettings) -> bool:
     """Return True if all code that ``task`` names has been run in this process."""
-    return str(task.get("name")) in TASKS and {*modules(task)} <= {*sys.modules}
+    return task.name in TASKS and {*task.modules} <= {*sys.modules}
 
 
-def run_code(task: Mapping[str, Any]) -> None:
-    """Run the script and import the modules that ``task`` names: the command line's own."""
-    name, file = str(task.get("name")), task.get("file")
+def run_code(cfg: DictConfig) -> Config:
+    """Run the code that the command line's ``task`` names, and return the configuration.
+
+    Raises:
+        QPError: the code cannot be run, or the configuration is invalid.
+    """
+    name, file = str(cfg.task.get("name")), cfg.task.get("file")
     if file is not None and name not in TASKS:
         expected = f"the Python file that registers task={name}"
         if name not in _registered_by(str(file), expected):
@@ -46,14 +42,16 @@ def run_code(task: Mapping[str, Any]) -> None:
         got = f"{file!r} with task={name}, which reads no file"
         remedy = "Leave out task to learn the one that the file registers."
         raise QPError.expected("task.file", got, "a task with a file", remedy)
-    own, colon, _ = str(task.get("id", "")).partition(":")
-    for module in [*([own] if colon else []), *modules(task)]:
+    read = Config.of(cfg)
+    own, colon, _ = getattr(read.task, "id", "").partition(":")
+    for module in [*([own] if colon else []), *read.task.modules]:
         try:
             importlib.import_module(module)
         except ImportError as error:
-            got = f"{task['id']!r}, and cannot import {module} ({error})"
+            got = f"{cfg.task.id!r}, and cannot import {module} ({error})"
             remedy = "Start in the folder that has it, or install it."
             raise QPError.expected("task.id", got, "MODULE:ID with a module", remedy) from error
+    return read
 
 
 def named_task(arguments: Sequence[str]) -> list[str]:
@@ -86,27 +84,3 @@ def _registered_by(file: str, expected: str) -> list[str]:
     before = {**TASKS}
     runpy.run_path(file, run_name="task_file")
     return [name for name, task in TASKS.items() if before.get(name) is not task]
-
-
-#: How train.py is started: by its path in a clone, and as a module from a wheel.
-COMMAND = "python -m torch_qpmpc.train" if PACKAGED.exists() else "python train.py"
-
-
-def _strings(value: Any) -> Iterator[str]:
-    if isinstance(value, DictConfig | ListConfig):
-        value = OmegaConf.to_container(value, resolve=True)
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping | list | tuple):
-        for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _strings(item)
-
-
-def _is_module(name: str) -> bool:
-    """Return True if ``name`` could be imported; its code does not run."""
-    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*", name):
-        return False
-    try:
-        return importlib.util.find_spec(name.partition(".")[0]) is not None
-    except ValueError:  # __main__, as under pytest
-        return True

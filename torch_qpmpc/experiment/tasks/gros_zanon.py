@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from omegaconf import DictConfig
 
 from torch_qpmpc.envs import GrosZanonLTI
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.rivals import Policy, tightened
 from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
@@ -15,14 +15,14 @@ from torch_qpmpc.mpc.scheme import Scheme
 WEIGHT = torch.tensor([1.0, 1.0, 0.5])
 
 
-def wrong_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
+def wrong_scheme(cfg: Config, plant: GrosZanonLTI) -> Scheme:
     """Return their wrong model; as in the original, the first upper bound is too wide by one."""
     wide = plant.ub_s + torch.tensor([1.0, 0.0]).to(plant.ub_s)
     model = Model(*plant.wrong_model())
     return plant_scheme(cfg, plant, model, WEIGHT, state_bounds=(plant.lb_s, wide))
 
 
-def true_scheme(cfg: DictConfig, plant: GrosZanonLTI) -> Scheme:
+def true_scheme(cfg: Config, plant: GrosZanonLTI) -> Scheme:
     A, B, offset = plant.true_model()
     return plant_scheme(cfg, plant, Model(A, B, offset=offset), WEIGHT)
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torch_qpmpc.envs import LinearSystem, Plant
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.logs import estimated, without_blow_ups
-from torch_qpmpc.experiment.tasks.registry import AnyPlant, find_task
+from torch_qpmpc.experiment.tasks.registry import AnyPlant
 from torch_qpmpc.identification.identification import check_excitation, measured_model
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.reading import as_log
@@ -107,9 +107,7 @@ class Start(NamedTuple):
         return entries | ({} if self.cost is None else {"R2_cost": self.cost.R2})
 
 
-def identified_start(
-    cfg: DictConfig, physics: AnyPlant, log: Any, order: int | None = None
-) -> Start:
+def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None = None) -> Start:
     """Identify the model and a missing stage cost from a log of the plant; see `identify`.
 
     The state is the estimate by the filter of a model of this ``order``, None for the one that
@@ -146,7 +144,7 @@ def identified_start(
     return chosen._replace(cost=cost)
 
 
-def identified_scheme(cfg: DictConfig, scheme: Scheme, start: Start) -> Scheme:
+def identified_scheme(cfg: Config, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
     cost = scheme.cost
     if cost.stage_weight is None:
@@ -206,7 +204,7 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
 
 
-def _observed_cost(cfg: DictConfig, start: Start) -> Cost:
+def _observed_cost(cfg: Config, start: Start) -> Cost:
     """Return the cost of a scheme from the start's; the constant has the log's mean after x_N."""
     gamma, layout, log = cfg.task.gamma, start.layout, start.log
     diagonal = cfg.task.hessian == "diagonal"
@@ -218,7 +216,7 @@ def _observed_cost(cfg: DictConfig, start: Start) -> Cost:
     return cost
 
 
-def nominal_mpcs(cfg: DictConfig, physics: AnyPlant, data: Sequence[TensorDictBase]) -> list[QPMPC]:
+def nominal_mpcs(cfg: Config, physics: AnyPlant, data: Sequence[TensorDictBase]) -> list[QPMPC]:
     """Make MPC with a model of logged steps and the plant's own cost and bounds, without learning.
 
     There is no discount. A task without a stage cost has the one fitted to the rewards, and a

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from omegaconf import DictConfig
 
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.point_mass import NOISE_STD
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.rivals import Policy, tightened
 from torch_qpmpc.experiment.tasks.registry import Task, plant_scheme, register
 from torch_qpmpc.mpc.model import Model
@@ -19,18 +19,18 @@ NAMES = {
 }
 
 
-def make_plant(cfg: DictConfig) -> PointMass:
+def make_plant(cfg: Config) -> PointMass:
     return PointMass(noise_kind=cfg.noise.name, noise_std=cfg.noise.std)
 
 
-def wrong_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
+def wrong_scheme(cfg: Config, plant: PointMass) -> Scheme:
     """Draw the corrupted model and the cost by ``cfg.seed``."""
     A, B, theta = plant.corrupted(cfg.seed)
     weight = torch.cat((theta, torch.zeros_like(plant.lb_a)))
     return plant_scheme(cfg, plant, Model(A, B), weight)
 
 
-def true_scheme(cfg: DictConfig, plant: PointMass) -> Scheme:
+def true_scheme(cfg: Config, plant: PointMass) -> Scheme:
     A, B, offset = plant.true_model()
     weight = torch.cat((2 * plant.W.diagonal(), torch.zeros_like(plant.lb_a)))
     return plant_scheme(cfg, plant, Model(A, B, offset=offset), weight)

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings
 from torch_qpmpc.experiment.rivals import Policy
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
@@ -23,60 +22,8 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 
-
-class Group(BaseModel):
-    """A group of keys that forbids unknown keys, converts no values, and takes finite numbers."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-
-
-def _equally_long(rows: list[list[float]]) -> list[list[float]]:
-    if not rows or any(len(row) != len(rows[0]) for row in rows):
-        raise ValueError("rows should be equally long")
-    return rows
-
-
-Whole = Annotated[int, Field(ge=0)]
-Count = Annotated[int, Field(ge=1)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(gt=0, le=1)]
-#: Weight of a slack; inf makes the row hard.
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=True)]
-Matrix = Annotated[list[list[float]], AfterValidator(_equally_long)]
-
-
 #: A plant of any kind.
 AnyPlant = LinearSystem | GymnasiumPlant | Plant
-#: All registered tasks by name.
-TASKS: dict[str, Task] = {}
-
-
-class TaskSettings(Group):
-    """The keys under ``task`` that all tasks share."""
-
-    name: str
-    #: The script that registers a user's task.
-    file: str | None = None
-    horizon: Count
-    gamma: Fraction
-    episode_steps: Count
-    eval_steps: Count
-    hessian: Literal["diagonal", "block"]
-    terminal_weight: Literal["default", "identity", "riccati"]
-    learn_cost: list[Literal["H", "H_f", "q", "c", "w"]]
-    state_slack: Weight
-    action_slack: Weight
-    discount_slack: bool
-
-    @model_validator(mode="after")
-    def riccati_is_dense(self) -> Self:
-        if self.terminal_weight == "riccati" and self.hessian == "diagonal":
-            remedy = "The Riccati weight needs task.hessian=block."
-            raise QPError.expected(
-                "task.terminal_weight", "'riccati'", "default or identity", remedy
-            )
-        return self
 
 
 @dataclass(frozen=True)
@@ -109,15 +56,15 @@ class Task:
     """
 
     name: str
-    make_plant: Callable[[DictConfig], Any]
-    wrong_scheme: Callable[[DictConfig, Any], Scheme]
-    true_scheme: Callable[[DictConfig, Any], Scheme] | None = None
-    masks: Callable[[DictConfig, Any], Mapping[str, Tensor]] = lambda cfg, plant: {}
+    make_plant: Callable[[Config], Any]
+    wrong_scheme: Callable[[Config, Any], Scheme]
+    true_scheme: Callable[[Config, Any], Scheme] | None = None
+    masks: Callable[[Config, Any], Mapping[str, Tensor]] = lambda cfg, plant: {}
     closed_loop: Callable[..., ClosedLoop] = closed_loop
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
     rivals: Mapping[str, Callable[[Any], Policy]] = field(default_factory=dict)
-    nominal_scheme: Callable[[DictConfig, Any], Scheme] | None = None
+    nominal_scheme: Callable[[Config, Any], Scheme] | None = None
     episode: Callable[[Any, Tensor], Mapping[str, Any]] = lambda plant, d: {}
     settings: type[TaskSettings] = TaskSettings
     defaults: Mapping[str, Any] | None = field(default_factory=dict)
@@ -132,7 +79,7 @@ def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
 
 
 def plant_scheme(
-    cfg: DictConfig,
+    cfg: Config,
     plant: AnyPlant,
     model: Model,
     stage_weight: Tensor | None,
@@ -155,10 +102,11 @@ def plant_scheme(
     )
 
 
-def priced(cfg: DictConfig, bounds: Bounds) -> Bounds:
+def priced(cfg: Config, bounds: Bounds) -> Bounds:
     """Return the bounds with the slack weights of ``cfg.task``."""
-    slacks = {name: cfg.task[name] for name in ("state_slack", "action_slack", "discount_slack")}
-    return replace(bounds, **slacks)
+    task = cfg.task
+    slacks = {"state_slack": task.state_slack, "action_slack": task.action_slack}
+    return replace(bounds, **slacks, discount_slack=task.discount_slack)
 
 
 def register(task: Task) -> None:
@@ -185,21 +133,3 @@ def register(task: Task) -> None:
         "task": {"terminal_weight": "default", **task.defaults.get("task", {}), **own},
     }
     ConfigStore.instance().store(task.name, node, group="task", package="_global_")
-
-
-def learned_parts(cfg: DictConfig) -> tuple[str, ...]:
-    """Return the parts of theta that learn."""
-    return (*cfg.task.learn_cost, *cfg.constraint.learn)
-
-
-def find_task(settings: Mapping[str, Any]) -> Task:
-    """Find a task by the keys under ``task``; raise `QPError` if its script has not run."""
-    name, file = settings.get("name"), settings.get("file")
-    if name in TASKS:
-        return TASKS[name]
-    got = repr(name) if "name" in settings else "nothing"
-    if file is None:
-        raise QPError.expected("task.name", got, f"one of {', '.join(TASKS)}")
-    remedy = "Name it on the command line with task.file=FILE, or run it before."
-    want = f"a script that has registered {got}"
-    raise QPError.expected("task.file", f"{file!r}, which has not run", want, remedy)
