@@ -289,29 +289,6 @@ class Swing(Lag):
         return self.y, -(self.y.item() ** 2), False, False, {}
 
 
-class Stocked(Swing):
-    """A swing whose cost is that of a stock, which no output shows and the inputs fill."""
-
-    def reset(self, *, seed=None, options=None):
-        self.stock = 0.0
-        return super().reset(seed=seed)
-
-    def step(self, action):
-        cost = (self.stock + action.item()) ** 2
-        self.stock = 0.96 * self.stock + 0.3 * action.item()
-        return super().step(action)[0], -cost, False, False, {}
-
-
-def test_a_cost_of_a_state_that_no_output_shows_is_one_of_smoothed_inputs(monkeypatch):
-    plant_is(monkeypatch, Stocked)
-    cfg = make_config(*DATA)
-    physics: Any = make_physics(cfg)
-    named = candidates(cfg, physics, collect_log(cfg, physics))
-    start, outputs = named[ESTIMATE], named[OUTPUTS]
-    assert start.cost.R2 > 0.98 > 0.8 > outputs.cost.R2
-    assert (start.model.A[-2:, -2:] == (1 - 0.5**5) * np.eye(2)).all()
-
-
 @pytest.fixture
 def swing(monkeypatch):
     plant_is(monkeypatch, Swing)

@@ -71,18 +71,6 @@ def test_first_gains_are_those_of_the_textbook_filter():
         P = A @ (P - L @ V @ L.T) @ A.T + Q
 
 
-def test_a_model_remembers_its_smoothed_outputs_and_inputs():
-    form = true_form()._replace(x0=np.ones(3), P0=np.zeros((3, 3)))  # with steady gains
-    y, u, d = arrays(noisy(1, 40))[0]
-    estimates = form.estimates(y, u, d)
-    own = form.remembering(0.9).estimates(y, u, d)
-    np.testing.assert_allclose(own[:, :3], estimates, atol=1e-9)
-    m = np.concatenate((C @ np.ones(3), np.zeros(u.shape[1])))
-    for k in range(40):
-        np.testing.assert_allclose(own[k, 3:], m, atol=1e-9)
-        m = 0.9 * m + 0.1 * np.concatenate((C @ estimates[k], u[k]))
-
-
 def test_a_fit_has_the_poles_gain_and_noise_of_the_plant():
     data = noisy(20, 200)
     model, true = fit_state_space(data, 3, 10).model, true_form()

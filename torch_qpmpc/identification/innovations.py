@@ -117,22 +117,6 @@ class Innovations(NamedTuple):
             errors[..., : steps - h, h, :] = y[..., h + 1 :, :] - x @ self.C.T
         return errors
 
-    def remembering(self, pole: float | None) -> Innovations:
-        r"""Return the model with m_{k+1} = pole m_k + (1 - pole) [C \xi_k; u_k] as further states.
-
-        m_0 is [C x0; 0]. None adds none.
-        """
-        if pole is None:
-            return self
-        (n, n_u), n_y = self.B.shape, len(self.C)
-        T = np.eye(n + n_y + n_u, n)
-        model = self.transformed(T, T.T, np.zeros(len(T)))
-        model.A[n:, n:] = pole * np.eye(n_y + n_u)
-        model.A[n : n + n_y, :n] = (1 - pole) * self.C
-        model.B[n + n_y :] = (1 - pole) * np.eye(n_u)
-        model.x0[n : n + n_y] = self.C @ self.x0
-        return model
-
     def transformed(self, T: Array, inverse: Array, shift: Array) -> Innovations:
         r"""Return the model of the states T \xi + shift; ``inverse @ T`` is the identity."""
         A = T @ self.A @ inverse

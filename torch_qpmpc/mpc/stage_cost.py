@@ -276,13 +276,6 @@ def fit_rewards(
     return fitted
 
 
-def missed(log: Any, layout: Layout) -> float:
-    """Return the share of the costs' variance that is left by one of any sign in (d_k, x_k)."""
-    x, u, _, cost, _ = zip(*(_observed(steps, layout) for steps in logs(log)), strict=True)
-    x, u, cost = map(torch.cat, (x, u, cost))
-    return 1 - fit_stage_cost(torch.cat((x, u), -1), cost, x.shape[1]).R2
-
-
 def _before(after: StageCost, model: Innovations, C: Tensor, noise: Tensor) -> StageCost:
     """Return the cost of (x_k, u_k) whose (C x_{k+1}, u_k) has the cost ``after``, in the mean.
 

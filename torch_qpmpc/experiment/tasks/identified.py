@@ -35,14 +35,11 @@ from torch_qpmpc.mpc.riccati import (
     terminal_riccati,
 )
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.stage_cost import GOOD, LEFT, StageCost, fit_rewards, missed, poor, scheme_cost
+from torch_qpmpc.mpc.stage_cost import GOOD, StageCost, fit_rewards, poor, scheme_cost
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 if TYPE_CHECKING:
     from torch_qpmpc.experiment.choosing import Choice
-
-#: A cost that the states explain poorly may be one of outputs and inputs smoothed by such a pole.
-POLES = [1 - 0.5**k for k in range(1, 8)]
 
 
 class Start(NamedTuple):
@@ -111,8 +108,7 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     """Identify the model and a missing stage cost from a log of the plant; see `identify`.
 
     The state is the estimate by the filter of a model of this ``order``, None for the one that
-    `fit_state_space` chooses. Where that explains the rewards poorly and leaves twice as much as
-    with smoothed outputs and inputs, it has these, too. That of a `LinearSystem` is measured.
+    `fit_state_space` chooses. That of a `LinearSystem` is measured.
     """
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     observed = not isinstance(physics, LinearSystem)
@@ -123,25 +119,14 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
         data, order = as_log(log), 0
     check_excitation(data)
 
-    def start(pole: float | None = None) -> Start:
-        model = fit.model.remembering(pole)
-        steps = estimated(log, model) if observed else log
-        return Start(steps, model, cfg.task.horizon, fit.order, observed, cut=cut)
-
-    def left(start: Start) -> float:
-        return missed(start.log, start.layout)
-
     fit = fit_state_space(data.trajectories, order)
-    chosen = start()
-    scheme = find_task(cfg.task).wrong_scheme(cfg, chosen.plant(physics))
+    steps = estimated(log, fit.model) if observed else log
+    start = Start(steps, fit.model, cfg.task.horizon, fit.order, observed, cut=cut)
+    scheme = find_task(cfg.task).wrong_scheme(cfg, start.plant(physics))
     if scheme.cost.stage_weight is not None:
-        return chosen
-    if fit.order and (own := left(chosen)) > 1 - GOOD:
-        least, best = min(((left(one), one) for one in map(start, POLES)), key=lambda pair: pair[0])
-        chosen = best if least < LEFT * own else chosen
+        return start
     diagonal = cfg.task.hessian == "diagonal"
-    cost = fit_rewards(chosen.log, chosen.layout, diagonal, chosen.model)
-    return chosen._replace(cost=cost)
+    return start._replace(cost=fit_rewards(steps, start.layout, diagonal, start.model))
 
 
 def identified_scheme(cfg: Config, scheme: Scheme, start: Start) -> Scheme:
