@@ -86,7 +86,7 @@ def zoned(half: float, **options: Any) -> qm.Controller:
 @pytest.mark.parametrize("half", [0.2, 20.0])
 def test_zones_are_those_of_python_with_gaps_and_in_manual_mode(half):
     controller, twin = exported_once(zoned, missing=True, half=half)
-    assert controller.mpc.anchors == 1
+    assert controller.mpc.design.steady.anchors == 1
     rng, x, at, codes = np.random.default_rng(4), np.zeros(3), 0, set()
     for k in range(200):
         if k % 25 == 0:

@@ -43,7 +43,7 @@ def nearest(mpc: qm.LinearMPC, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("seed", range(6))
 def test_inputs_that_the_set_point_leaves_free_are_near_their_target(seed):
     mpc, rng = drawn(seed), np.random.default_rng([seed, 1])
-    assert mpc.anchors
+    assert mpc.design.steady.anchors
     for size in (0.3, 1.0, 4.0):
         r = size * rng.normal(size=len(mpc.design.Q))
         target, (y, u) = mpc.target(r), nearest(mpc, r)
@@ -81,7 +81,7 @@ def test_zones_hold_the_outputs_that_free_inputs_move(seed):
     half, price, Q = rng.uniform(0.1, 2), rng.uniform(5, 50), np.diag([1.0, 0.0, 0.0])
     zones = {"y_bounds": ([-np.inf, -half, -half], [np.inf, half, half]), "y_slack": price}
     mpc = qm.LinearMPC((A, B, C), 2, Q=Q, R=0.1, u_bounds=(-1.0, 1.0), **zones)
-    gain, n = C @ np.linalg.solve(np.eye(3) - A, B), mpc.anchors
+    gain, n = C @ np.linalg.solve(np.eye(3) - A, B), mpc.design.steady.anchors
     assert n == 2
     # The entries are u and the zones' violations.
     rows = np.block([[gain[1:], -np.eye(2)], [-gain[1:], -np.eye(2)]])

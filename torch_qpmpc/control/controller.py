@@ -11,15 +11,16 @@ import numpy as np
 import torch
 
 from torch_qpmpc.checks import check_kind
+from torch_qpmpc.control.design import Target
 from torch_qpmpc.control.explain import Explanation, explain
 from torch_qpmpc.control.exporting import ControllerExport, export_controller, export_controller_fmu
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.learning import LearningReport, improve, learn
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target, check_theta, packed, unpacked
+from torch_qpmpc.control.linear_mpc import LinearMPC, check_theta, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, ready, simulate
-from torch_qpmpc.control.state_space import Array, read_measured, read_row
+from torch_qpmpc.control.state_space import Array, read_measured, read_table
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
@@ -101,8 +102,8 @@ class Controller:
         Raises:
             QPError: an argument is invalid.
         """
-        self._law = law = ready(self._law.renewed())
-        memory = law.begun(None if u is None else read_row("u", u, law.design.plant.inputs))
+        self._law = law = ready(replace(self._law))  # with today's theta
+        memory = law.begun(None if u is None else read_table("u", u, law.design.plant.inputs, 1)[0])
         memory = memory._replace(r=self.r)
         y = None if y is None else law.read("y", y, 1)[0]
         if known is not None or y is not None:
@@ -116,9 +117,9 @@ class Controller:
         """Take a memory without a step."""
         self._memory = memory
         self.status = Outcome.SOLVED
+        self._now: Signals | None = None
         self.target: Target | None = None
         self.p = torch.zeros(self.mpc.plan.n_p)
-        self._now: Signals | None = None
 
     def __repr__(self) -> str:
         """Return its design and the last input."""
@@ -191,7 +192,8 @@ class Controller:
         move = law.step(self._memory, *self._now)
         self._memory, self.status, self._plan = move.memory, move.status, move.plan
         if move.target is not None and move.p is not None:
-            self.target, self.p = move.target, move.p
+            self.p, *target = map(torch.from_numpy, (move.p, *move.target))
+            self.target = Target(*target)
         if isinstance(y, Mapping):
             return dict(zip(law.design.plant.inputs, move.u.tolist(), strict=True))
         return move.u.copy()
@@ -231,7 +233,7 @@ class Controller:
             QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
         """
         law = self._law.redesigned(**changes)
-        law.check_runs(self._memory.runs)
+        law.check_runs(self._memory)
         self._law = ready(law)
         u = np.clip(self.u, *self.mpc.design.u_bounds)
         self._memory, self._now = self._memory._replace(u=u), None
@@ -291,7 +293,7 @@ class Controller:
             QPError: an argument is invalid.
             SolverError: no input satisfies the hard bounds in a step.
         """
-        return simulate(self._law.renewed(), self._memory, plant, steps, r, **options)
+        return simulate(replace(self._law), self._memory, plant, steps, r, **options)
 
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
@@ -319,7 +321,7 @@ class Controller:
                 state and a filter.
             SolverError: no input satisfies the hard bounds in a step of this controller.
         """
-        law = self._law.renewed()
+        law = replace(self._law)
         report, candidate = learn(law, self._memory, source, transitions, **options)
         if report.accepted:
             self._law = ready(candidate)
@@ -345,7 +347,7 @@ class Controller:
         Raises:
             QPError: an argument is invalid, the log determines no model, or the MPC learns nothing.
         """
-        report, law = improve(self._law.renewed(), self._memory, log, r, spread, **options)
+        report, law = improve(replace(self._law), self._memory, log, r, spread, **options)
         if report.kept:
             law, before = ready(law), {x.name for x in self.review(r).faults}
             faults = [x for x in review(law, self._memory, r, None).faults if x.name not in before]
@@ -370,7 +372,7 @@ class Controller:
             QPError: r or known is invalid.
             SolverError: the bounds of the inputs admit no steady state.
         """
-        return review(self._law.renewed(), self._memory, r, known)
+        return review(replace(self._law), self._memory, r, known)
 
     def explain(self) -> Explanation:
         """Return the last plan, what holds it back, and what is in reach; ``print`` shows it.
@@ -406,7 +408,7 @@ class Controller:
         Raises:
             QPError: as in `export_c`, or the self-test fails.
         """
-        return export_controller(self._law.renewed(), self._memory, folder, name, **options)
+        return export_controller(replace(self._law), self._memory, folder, name, **options)
 
     def export_fmu(
         self, path: str | Path, *, name: str = "policy", **options: Any
@@ -414,14 +416,14 @@ class Controller:
         """Write this controller as an FMU of FMI 3.0 for co-simulation, with sources and a library.
 
         With an output T, an input q and a known signal d, its inputs are ``y.T`` (NaN if missing),
-        ``r.T`` and ``known.d``, a vector of its N + 1 stages, where a NaN holds the stage before;
-        its outputs are ``u.q`` and ``status``. While ``manual`` is true, it records ``applied.q``
-        as `observe` does. The parameter ``last.q`` is the input before the start, and with
-        ``rests`` it starts as by ``reset(y, u, known)``. ``lower.q`` and ``upper.q`` are bounds. A
-        step takes the model's dt, or a second. ``name`` is the model's identifier; the options are
-        ``max_iterations`` and ``storage`` of `export_c`, whose report it returns for ``path``.
+        ``r.T`` and ``known.d`` for N + 1 stages, where a NaN holds the stage before; its outputs
+        are ``u.q`` and ``status``. While ``manual`` is true, it records ``applied.q`` as `observe`
+        does. ``last.q`` is the input before the start, and with ``rests`` it starts as by
+        ``reset(y, u, known)``. ``lower.q`` and ``upper.q`` are bounds. A step takes the model's dt,
+        or a second. ``name`` is the model's identifier; the options are ``max_iterations`` and
+        ``storage`` of `export_c`, whose report it returns for ``path``.
 
         Raises:
             QPError: no C compiler is installed, or as in `export_c`.
         """
-        return export_controller_fmu(self._law.renewed(), self._memory, path, name, **options)
+        return export_controller_fmu(replace(self._law), self._memory, path, name, **options)

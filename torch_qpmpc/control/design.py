@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,28 +27,27 @@ REFERENCES = ("held", "preview")
 Y_SLACK = 1e3
 
 
+class Target(NamedTuple):
+    """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``.
+
+    The plan weighs the set-points r ``(*batch, n_y)``, see `Design.weighed`. They are tensors, or
+    arrays in a `Law`.
+    """
+
+    x: Any
+    u: Any
+    y: Any
+    r: Any
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """The arguments of `LinearMPC`, read and checked, as arrays.
 
-    Attributes:
-        plant: the model.
-        horizon: N.
-        Q, R, dR: the weights, ``(n_y, n_y)`` and ``(m, m)`` twice.
-        y_bounds, u_bounds, du_bounds: pairs (lower, upper), infinite where there is none.
-        y_slack: the price of a unit of violation of ``y_bounds``, ``(n_y,)``; inf is hard, and
-            NaN becomes `price`.
-        linear: known signals, by index, or numbers that multiply inputs, by input.
-        references: "held" or "preview".
-        disturbances: B_w, C_w and names.
-        gamma: the discount.
-        blocks: numbers of stages that share one input.
-        levels: the levels of inputs that take only these, by name; ``u_bounds`` are within them.
-        switching: the other arguments of `Bounds` for them.
-        limits: known signals that bound an output or input from below and above, by its name, ""
-            on a side without one.
-        u_target: what inputs rest near, by name; see `resting`.
-        violation: the share of steps in which outputs may leave a bound, by name; see `margins`.
+    Weights are ``(n_y, n_y)`` and ``(m, m)``, NaN in ``y_slack`` ``(n_y,)`` becomes `price`, and
+    ``u_bounds`` are within the ``levels`` of inputs, with the other arguments of `Bounds` for these
+    in ``switching``. Known signals that bound an output or input from below and above are in
+    ``limits`` by its name, "" on a side without one.
 
     Raises:
         QPError: a number is invalid, or nothing has a cost.
@@ -104,13 +103,11 @@ class Design:
         parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
         return "; ".join(parts)
 
-    def merged(self, name: str, changes: Mapping[str, Any]) -> Any:
-        """Return an argument of `LinearMPC` as it is, but for the entries that ``changes`` names.
+    def merged(self, name: str, changes: Mapping[str, Any], names: Sequence[str]) -> Any:
+        """Return an argument of `LinearMPC` as it is, but for those ``names`` in ``changes``.
 
         Weights of two signals stay with both; None removes a bound or all weights of a signal.
         """
-        of_y = name in ("Q", "y_bounds", "y_slack", "violation")
-        names = self.plant.outputs if of_y else self.plant.inputs
         if unknown := sorted({*changes} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         old = getattr(self, name)
@@ -230,12 +227,12 @@ class Design:
 
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
-        """Masks of the outputs and of the inputs with bounds, ``(n_y,)`` and ``(m,)``."""
+        """The places of the outputs and of the inputs with bounds."""
         y, u = (
             np.isfinite(bounds).any(0) | (of >= 0).any(0)
             for bounds, of in zip((self.y_bounds, self.u_bounds), self.limited, strict=True)
         )
-        return y & (self.y_slack > 0), np.asarray(u)
+        return np.flatnonzero(y & (self.y_slack > 0)), np.flatnonzero(u)
 
     @cached_property
     def limited(self) -> tuple[Array, Array]:
@@ -292,7 +289,7 @@ class Design:
         margins, errors = np.zeros((2, len(self.Q))), self.plant.errors
         for name, share in self.violation.items():
             i, got = self.plant.outputs.index(name), f"{share:g} of {name}"
-            if not 0 < share < 1 or not self.bounded[0][i]:
+            if not 0 < share < 1 or i not in self.bounded[0]:
                 raise QPError.expected("violation", got, "a share in (0, 1), of a bounded output")
             k = int(self.answers(DECIDES)[i])
             e = np.zeros(0) if errors is None else np.sort(errors[:, k - 1 : k, i], axis=None)
@@ -332,41 +329,68 @@ class Design:
         prices = torch.where(outside > 0, torch.as_tensor(self.y_slack), 0.0)  # inf times 0 is none
         return cost + (prices * outside).sum(-1)
 
-    def arranged(self, arrays: Any, x: Any, target: Sequence[Any], u_last: Any, known: Any) -> Any:
+    def arranged(self, arrays: Any, x: Any, target: Target, u_last: Any, known: Any) -> Any:
         """Return `LinearMPC.arrange`, for signals of one batch shape in ``torch`` or ``np`` arrays.
 
-        They are ``(*batch, n)``, the parts of a `Target`, with a dimension for the stages if it is
-        `staged`, ``(*batch, m)`` and ``(*batch, N + 1, n_d)``.
+        They are ``(*batch, n)``, a target, with a dimension for the stages if it is `staged`,
+        ``(*batch, m)`` and ``(*batch, N + 1, n_d)``.
         """
-        signals = self.acts, self.nominal, self.weighted, *self.bounded_places
-        acts, nominal, of_r, of_y, of_u = map(arrays.asarray, signals)
-        ahead, (_, inputs, _, aims) = [known - (known[..., -1:, :] * acts + nominal)], target
-        x_s, u_s, y_s, r = (part[..., -1, :] for part in target) if self.staged else target
-        if self.staged and self.R.any():
-            ahead.insert(0, inputs - u_s[..., None, :])
-        off = [(y_s - r)[..., of_r]] if self.references == "held" else []
-        if not off:
-            ahead.insert(0, (aims - y_s[..., None, :])[..., of_r])
-        ahead = arrays.concatenate(ahead, -1)
-        du = (u_last - u_s)[..., : len(self.R) if self.moves else 0]
-        parts = x - x_s, du, *off, y_s[..., of_y], u_s[..., of_u], arrays.ones_like(x[..., :1])
-        return arrays.concatenate((ahead.reshape(*ahead.shape[:-2], -1), *parts), -1)
+        batch, constants = x.shape[:-1], arrays.asarray(np.append(self.nominal, [0.0, 1.0]))
+        constants = arrays.broadcast_to(constants, (*batch, len(constants))) if batch else constants
+        parts = [part.reshape(*batch, -1) for part in (x, *target, u_last, known, constants)]
+        signals, (plus, minus) = arrays.concatenate(parts, -1), map(arrays.asarray, self.taken)
+        return signals[..., plus] - signals[..., minus]
+
+    @cached_property
+    def differences(self) -> dict[str, tuple[Array, Array]]:
+        """The places of the two signals in `arranged` whose difference p has, by name and stage."""
+        n, m, n_y, n_d = self.plant.sizes
+        N, rows = self.horizon + 1, self.horizon + 1 if self.staged else 1
+        widths, stages = (n, n, m, n_y, n_y, m, n_d, n_d, 1, 1), (1, *[rows] * 4, 1, N, 1, 1, 1)
+        ends = np.cumsum(np.multiply(widths, stages))
+        x, x_s, u_s, y_s, r, u_last, known, nominal, zero, one = (
+            np.arange(end - k * width, end).reshape(k, width)
+            for k, width, end in zip(stages, widths, ends, strict=True)
+        )
+        of_r, (of_y, of_u), none = self.weighted, self.bounded, (zero[:, :0], zero[:, :0])
+        held, varies = self.references == "held", self.staged and self.R.any()
+        return {
+            "r": none if held else (r[:, of_r], y_s[-1:, of_r]),
+            "u_r": (u_s, u_s[-1:]) if varies else none,
+            "known": (known, np.where(self.acts, known[-1:], nominal)),
+            "x": (x, x_s[-1:]),
+            "u_last": (u_last, u_s[-1:]) if self.moves else none,
+            "off": (y_s[-1:, of_r], r[-1:, of_r]) if held else none,
+            "y_s": (y_s[-1:, of_y], zero),
+            "u_s": (u_s[-1:, of_u], zero),
+            "one": (one, zero),
+        }
+
+    @cached_property
+    def taken(self) -> Array:
+        """The places of all `differences`, in the order of p, ``(2, n_p)``."""
+        pairs = [np.stack(np.broadcast_arrays(*pair)) for pair in self.differences.values()]
+        stages = [np.broadcast_to(x, (2, self.horizon + 1, x.shape[2])) for x in pairs[:3]]
+        stages = np.concatenate(stages, 2).reshape(2, -1)
+        return np.hstack((stages, *(x[:, 0] for x in pairs[3:])))
 
     @cached_property
     def acts(self) -> Array:
-        """One for known signals that act on the plant, else zero, ``(n_d,)``."""
-        return self.plant.E.any(0).astype(float)
-
-    @cached_property
-    def bounded_places(self) -> tuple[Array, Array]:
-        """The places of the outputs and of the inputs with bounds."""
-        of_y, of_u = map(np.flatnonzero, self.bounded)
-        return of_y, of_u
+        """Mask of the known signals that act on the plant, ``(n_d,)``."""
+        return self.plant.E.any(0)
 
     @cached_property
     def weighted(self) -> Array:
         """The places of the outputs with a weight."""
         return np.flatnonzero(self.Q.any(0))
+
+    def steady_state(self, arrays: Any, v: Any, s: Any, lam: Any) -> Target:
+        """Return the target of v, ``s = [r; w; d; 1]`` and the target's multipliers."""
+        Z, M = map(arrays.asarray, self.steady.maps)
+        n, m, n_y, _ = self.plant.sizes
+        r, rest = s[..., :n_y], v @ Z.T + s[..., n_y:] @ M.T
+        x, u, y = rest[..., :n], rest[..., n : n + m], rest[..., n + m :]
+        return Target(x, u, y, self.weighed(arrays, r, y, lam))
 
     @cached_property
     def pulls(self) -> tuple[Array, Array]:
@@ -383,9 +407,9 @@ class Design:
         Bounds after the horizon do not act, so that the plan would leave y_s with their part of
         y_s - r. The signals are `arranged`'s, and ``lam`` ``(*batch, n_g)`` the target's.
         """
-        moved, shifts, Q = map(arrays.asarray, (*self.pulls, self.Q))
-        if not shifts.shape[1]:
+        if not self.pulls[1].size:
             return r
+        moved, shifts, Q = map(arrays.asarray, (*self.pulls, self.Q))
         own = (y_s - r) @ moved.T
         pull = own + lam[..., -shifts.shape[1] :] @ shifts.T
         size, share = ((pull @ Q * x).sum(-1)[..., None] for x in (pull, own))
@@ -416,26 +440,11 @@ class Design:
 
     @cached_property
     def places(self) -> dict[str, slice]:
-        """Return the places of the signals in a stage [d_k; x_k; u_k], see `LinearMPC`."""
-        n, m, _, n_d = self.plant.sizes
-        previewed, n_r = self.references == "preview", len(self.weighted)
-        parts = {
-            "r": n_r if previewed else 0,
-            "u_r": m if self.staged and self.R.any() else 0,
-            "known": n_d,
-            "x": n,
-            "u_last": m if self.moves else 0,
-            "off": 0 if previewed else n_r,
-            "y_s": int(self.bounded[0].sum()),
-            "u_s": int(self.bounded[1].sum()),
-            "one": 1,
-            "u": m,
-        }
-        ends = np.cumsum([*parts.values()])
-        return {
-            name: slice(int(end) - size, int(end))
-            for (name, size), end in zip(parts.items(), ends, strict=True)
-        }
+        """The places of the signals in a stage [d_k; x_k; u_k]."""
+        widths = {name: plus.shape[1] for name, (plus, _) in self.differences.items()}
+        widths["u"] = len(self.R)
+        ends = zip(widths.items(), np.cumsum([*widths.values()]).tolist(), strict=True)
+        return {name: slice(end - width, end) for (name, width), end in ends}
 
     def selectors(self) -> dict[str, Array]:
         """Return the rows that read each signal from a stage [d_k; x_k; u_k]."""
@@ -573,13 +582,13 @@ def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
     return {key: x for key, x in pairs if not np.isnan(x)}
 
 
-def read_moves(du_bounds: Any, names: Sequence[str]) -> tuple[Array, Array]:
+def read_moves(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
     """Read bounds of moves, which must allow to hold an input."""
-    lower, upper = read_bounds("du_bounds", du_bounds, names)
-    for name, *pair in zip(names, lower, upper, strict=True):
+    lower, upper = read_bounds(name, value, names)
+    for key, *pair in zip(names, lower, upper, strict=True):
         if not pair[0] <= 0 <= pair[1]:
-            got, want = f"({pair[0]:g}, {pair[1]:g}) for {name}", "bounds with zero between them"
-            raise QPError.expected("du_bounds", got, want, "An input must be able to stay.")
+            got, want = f"({pair[0]:g}, {pair[1]:g}) for {key}", "bounds with zero between them"
+            raise QPError.expected(name, got, want, "An input must be able to stay.")
     return lower, upper
 
 

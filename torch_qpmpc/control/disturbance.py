@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -203,10 +204,10 @@ class Steady:
     y: Array
     W: Array
 
-    @property
-    def maps(self) -> tuple[tuple[Array, Array], ...]:
-        """The maps of v and of [w; d; 1] to x_s, to u_s and to y_s."""
-        return (self.X, self.x), (self.U, self.u), (self.Y, self.y)
+    @cached_property
+    def maps(self) -> tuple[Array, Array]:
+        """The maps of v and of [w; d; 1] to [x_s; u_s; y_s]."""
+        return np.vstack((self.X, self.U, self.Y)), np.vstack((self.x, self.u, self.y))
 
     @classmethod
     def of(
@@ -258,3 +259,8 @@ class Steady:
     def n_a(self) -> int:
         """The number of entries of a, which determine the outputs with a weight."""
         return self.Y.shape[1] - len(self.W)
+
+    @property
+    def anchors(self) -> int:
+        """The length of f_0, see `torch_qpmpc.control.lowering`: f's if outputs have a weight."""
+        return len(self.W) if self.n_a else 0

@@ -274,7 +274,7 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
     tables = [array(key, x, dtype) for key, x in _tables(law, dtype, missing).items()]
     names = "OF_R", "OF_Y", "OF_U", "LOWER_OF", "UPPER_OF"
-    places = design.weighted, *design.bounded_places, *design.limited[1]
+    places = design.weighted, *design.bounded, *design.limited[1]
     tables += map(integers, names, places)
     replayed = _replayed(law, loop, dtype)
     examples = {
@@ -305,15 +305,14 @@ def _signals(plant: StateSpace, name: str) -> list[str]:
 
 
 def _sizes(law: Law) -> dict[str, int]:
-    design, observer = law.design, law.observer
-    n, m, n_y, n_d = design.plant.sizes
+    (n, m, n_y, n_d), design, observer = law.design.plant.sizes, law.design, law.observer
     width = {key: place.stop - place.start for key, place in design.places.items()}
     stages, n_e, levels = design.horizon + 1, len(observer.F), law.mpc.plan.levels
     of = {"N_R": "r", "N_UR": "u_r", "OFF": "off", "MOVES": "u_last"}
     of |= {"BOUNDED_Y": "y_s", "BOUNDED_U": "u_s"}
     sizes = {"N_X": n, "N_W": n_e - n, "N_E": n_e, "N_U": m, "N_Y": n_y, "N_D": n_d}
     sizes |= {"N_D_": max(n_d, 1), "GAINS": len(observer.gains), "STAGES": stages}
-    sizes |= {"N_F": law.mpc.anchors, "ROUNDS": ROUNDS}
+    sizes |= {"N_F": design.steady.anchors, "ROUNDS": ROUNDS}
     sizes |= {"SET_POINTS": stages if design.references == "preview" else 1}
     sizes |= {"WEIGHTED": len(design.weighted), "PULLS": int(design.pulls[1].size > 0)}
     sizes |= {"LEVELS": law.levels.shape[1], "RUNS": max(levels.rules.sum(1)) if levels else 0}
@@ -334,7 +333,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         **{key.upper(): x for key, x in own.items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
         **{f"{key.upper()}_L": getattr(steady, key) for key in "xuy"},
-        "ACTS": design.acts,
+        "ACTS": design.acts.astype(float),
         "NOMINAL": design.nominal,
         "U_LOWER": design.u_bounds[0],
         "U_UPPER": design.u_bounds[1],

@@ -10,12 +10,10 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from torch_qpmpc.control.design import Design, largest, read_wished
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target
-from torch_qpmpc.control.lowering import ROUNDS, followed
+from torch_qpmpc.control.design import Design, Target, largest, read_wished
+from torch_qpmpc.control.linear_mpc import LinearMPC
+from torch_qpmpc.control.lowering import aimed
 from torch_qpmpc.control.observer import (
     ABSURD,
     SMALL,
@@ -26,7 +24,7 @@ from torch_qpmpc.control.observer import (
     moving,
 )
 from torch_qpmpc.control.state_space import Array, read_table
-from torch_qpmpc.errors import QPError
+from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.mpc.levels import Searches
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.solve import AtRest
@@ -45,7 +43,8 @@ class Memory(NamedTuple):
         steps: the place of the next gain among `Observer.gains`, the last one from rest.
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
-        runs: for how many steps each input was on (above its lowest level), or with a minus off.
+        runs: for how many steps each input was on (above its lowest level), or with a minus off;
+            None in files without levels.
         ahead: the levels that the last plan has from the next step on, None without any.
         rest: the outputs and the input at rest that the last reset was passed, or None for each.
         P: the observer's P for the next step after a missing output, None while it is steady.
@@ -114,7 +113,7 @@ class Move(NamedTuple):
     memory: Memory
     status: Outcome
     target: Target | None = None
-    p: Tensor | None = None
+    p: Array | None = None
     plan: BatchSolution | None = None
 
 
@@ -169,10 +168,6 @@ class Law:
         """The solver of the target's QP."""
         return self.mpc.targets.at_rest()
 
-    def renewed(self) -> Law:
-        """Return the law with today's theta."""
-        return replace(self)
-
     def redesigned(self, **changes: Any) -> Law:
         """Return the law with other settings; see `Controller.redesign`."""
         names = {"noise": self.design.plant.outputs, "drift": self.design.disturbances.names}
@@ -194,7 +189,7 @@ class Law:
         last = np.zeros(len(self.design.plant.inputs)) if u is None else u
         last = np.clip(last, *self.design.u_bounds)
         steps = len(self.observer.gains) - 1 if rests else 0
-        runs = np.where(last > self.switches, LONG, -LONG)
+        runs = np.where(last > self.switches, LONG, -LONG) if self.design.levels else None
         return Memory(last, rest=(None, None if u is None else last), steps=steps, runs=runs)
 
     def estimates(self, memory: Memory) -> tuple[Array, Array]:
@@ -207,32 +202,25 @@ class Law:
 
         It raises for no value of them, so that the estimates go on.
         """
-        design, (memory, e, status) = self.design, self._seen(memory, y, known)
-        if valid := self._are_plausible(r, 0)[:, design.weighted].all():
+        design, n = self.design, len(self.design.plant.A)
+        memory, e, status = self._seen(memory, y, known)
+        if valid := self._are_plausible(r, 0).all():
             memory = memory._replace(r=r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
-        n, qp, aimed, last, steady = len(design.plant.A), self.mpc.plan, [], None, None
-        r = r if design.references == "preview" else r[0]
-        rows = np.hstack((np.broadcast_to(r, (len(known), len(design.Q))), known))
-        for row in rows[0 if design.staged else -1 :]:
-            if not aimed or (row != last).any():
-                last, steady = row, self._aimed(row[: len(r.T)], row[len(r.T) :], e[n:])
-            if steady is None:
-                return self._held(memory, e, Outcome.INFEASIBLE)
-            aimed.append(steady)
-        steady = [*map(np.stack, zip(*aimed, strict=True))] if design.staged else aimed[0]
-        p = design.arranged(np, e[:n], steady, memory.u, known)
+        try:
+            target = self._target(r, known, e[n:])
+        except SolverError:
+            return self._held(memory, e, Outcome.INFEASIBLE)
+        p = design.arranged(np, e[:n], target, memory.u, known)
         plan, ahead = self._planned(p, memory)
-        found, z = Status(int(plan.status[0])), plan.z[0]
-        if found not in (Status.SOLVED, Status.NODE_LIMIT):
-            proved = found == Status.INFEASIBLE
-            return self._held(memory, e, Outcome.INFEASIBLE if proved else Outcome.LIMIT)
-        status = Outcome.NODE_LIMIT if found == Status.NODE_LIMIT else status
-        u = self._within(aimed[-1][1] + z[qp.n_p : qp.n_p + qp.n_u], memory)
-        u, memory = self._on_level(u, memory), memory._replace(ahead=ahead)
-        target = Target(*map(torch.from_numpy, steady))
-        return Move(u, self._after(memory, e, u), status, target, torch.from_numpy(p), plan)
+        if (found := plan.status[0]) and found != Status.NODE_LIMIT:
+            status = Outcome.INFEASIBLE if found == Status.INFEASIBLE else Outcome.LIMIT
+            return self._held(memory, e, status)
+        u_s, moved = target.u[-1] if design.staged else target.u, plan.z[0, len(p) :]
+        u = self._on_level(self._within(u_s + moved[: len(u_s)], memory), memory)
+        memory = self._after(memory, e, u, ahead)
+        return Move(u, memory, Outcome.NODE_LIMIT if found else status, target, p, plan)
 
     def _planned(self, p: Array, memory: Memory) -> tuple[BatchSolution, Array | None]:
         """Return the plan, and the levels that it has from the next step on."""
@@ -255,9 +243,10 @@ class Law:
         lower, upper = (side[:, None] for side in self.design.u_bounds)
         return np.sort(np.where((lower <= own) & (own <= upper), own, np.inf))
 
-    def check_runs(self, runs: Any) -> None:
+    def check_runs(self, memory: Memory) -> None:
         """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
-        for i, (name, run) in enumerate(zip(self.design.plant.inputs, runs, strict=True)):
+        runs = [] if memory.runs is None else memory.runs
+        for i, (name, run) in enumerate(zip(self.design.plant.inputs, runs, strict=False)):
             word, levels = "on" if run > 0 else "off", self.levels[i, np.isfinite(self.levels[i])]
             left = self.design.switching[f"min_{word}"][i] - abs(run) if len(levels) else 0
             if left > 0 and not ((levels > self.switches[i]) == (run > 0)).any():
@@ -276,22 +265,31 @@ class Law:
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
         u = self._on_level(self._within(memory.u, memory), memory)
-        memory = memory._replace(ahead=None)
         return Move(u, self._after(memory, e, u), status)
 
-    def _aimed(self, r: Array, d: Array, w: Array) -> list[Array] | None:
-        """Return the parts of `LinearMPC.target` of a set-point; None if a QP has no solution."""
-        loads, n_f = np.concatenate((w, d - self.design.nominal, [1.0])), self.mpc.anchors
-        v, lam, now = np.zeros(0), np.zeros(0), (np.zeros(n_f), None)
-        for _ in range(ROUNDS):
-            state = np.concatenate((now[0], r, loads))
-            if (solution := self.aims.solve(state[None])).status[0]:
-                return None
-            v, lam = solution.z[0, len(state) : -len(state)], solution.lam[0]
-            if (now := followed(v[len(v) - n_f :], *now)) is None:
-                break
-        x, u, y = (Z @ v + M @ loads for Z, M in self.design.steady.maps)
-        return [x, u, y, self.design.weighed(np, r, y, lam)]
+    def _target(self, r: Array, known: Array, w: Array) -> Target:
+        """Return the `Target` for set-points and known signals by stage and an estimate of w.
+
+        Raises:
+            SolverError: its QP has no solution.
+        """
+        design, n_y = self.design, r.shape[1]
+        if not design.staged:
+            known = known[-1:]
+        s = np.empty((len(known), n_y + len(w) + known.shape[1] + 1))
+        s[:, :n_y] = r if design.references == "preview" else r[0]
+        s[:, n_y : n_y + len(w)] = w
+        s[:, n_y + len(w) : -1] = known - design.nominal
+        s[:, -1] = 1.0
+        target = aimed(design, np, self._aim, s)
+        return target if design.staged else Target(*(part[0] for part in target))
+
+    def _aim(self, state: Array) -> tuple[Array, Array]:
+        """Solve the target's QP, for one state or one for each stage."""
+        solution = self.aims.solve(state)
+        if solution.status.any():
+            raise SolverError("No input holds the plant within the hard bounds.")
+        return solution.z, solution.lam
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.
@@ -301,17 +299,17 @@ class Law:
         """
         memory, e, status = self._seen(memory, y, known)
         u = np.where(np.abs(u) <= self.max_plausible_u, u, memory.u)
-        return self._after(memory, e, u), status
+        memory = self._after(memory, e, u, memory.ahead)
+        return memory._replace(u=self._within(u, memory)), status
 
     @property
     def max_plausible_u(self) -> Array:
         """The largest size of an input that was applied, ``(m,)``."""
-        design = self.design
-        return ABSURD * np.maximum(largest(design.u_bounds), design.scaling.u)
+        return ABSURD * np.maximum(largest(self.design.u_bounds), self.design.scaling.u)
 
     def _are_plausible(self, signals: Array, known: int) -> Array:
         """Return the mask of outputs and set-points, or known signals, that may be measurements."""
-        return np.isfinite(signals) & (np.abs(signals) <= self.max_plausible[known])
+        return np.abs(signals) <= self.max_plausible[known]
 
     def _seen(self, memory: Memory, y: Array, known: Array) -> tuple[Memory, Array | None, Outcome]:
         """Return the memory with the known signals, the estimate corrected by y, and the status.
@@ -320,31 +318,36 @@ class Law:
         Instead of rows of known signals with an implausible entry the last ones hold.
         """
         seen, valid = self._are_plausible(y, 0), self._are_plausible(known, 1).all()
-        memory = memory._replace(known=known[0]) if valid else memory
-        observer, e = self.observer, memory.e
-        if e is None and not (valid and seen.all()):
-            return memory, None, Outcome.INVALID
+        every, observer, e, P = seen.all(), self.observer, memory.e, memory.P
+        taken = known[0] if valid else memory.known
+        if e is None and not (valid and every):
+            return memory._replace(known=taken), None, Outcome.INVALID
         last = len(observer.gains) - 1
         k = min(memory.steps, last)  # another model, or a file of another machine, had more
         if e is None:
             e = observer.start if k < last else observer.at_rest(memory.u, known[0], y)
-        gain, P = observer.gains[k], memory.P
-        if P is not None or not seen.all():
+        gain, error = observer.gains[k], y - observer.H @ e
+        if P is not None or not every:
             gain, P = observer.corrected(observer.spread(k) if P is None else P, seen)
-        e = e + gain @ np.where(seen, y - observer.H @ e, 0.0)
-        memory = memory._replace(steps=last if P is not None else min(k + 1, last), P=P)
-        status = Outcome.SOLVED if seen.all() else Outcome.MISSING
-        return memory, e, status if valid else Outcome.INVALID
+            error = np.where(seen, error, 0.0)
+        k = last if P is not None else min(k + 1, last)
+        status = Outcome.SOLVED if every else Outcome.MISSING
+        memory = memory._replace(known=taken, steps=k, P=P)
+        return memory, e + gain @ error, status if valid else Outcome.INVALID
 
-    def _after(self, memory: Memory, e: Array | None, u: Array) -> Memory:
+    def _after(
+        self, memory: Memory, e: Array | None, u: Array, ahead: Array | None = None
+    ) -> Memory:
         """Return the memory after a step with the input u."""
         if e is not None:
             assert memory.known is not None
             e = self.observer.predicted(e, u, memory.known)
-        on, runs = u > self.switches, np.zeros(len(u)) if memory.runs is None else memory.runs
-        runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
-        runs = np.clip(runs, -LONG, LONG).astype(np.int64)
-        return memory._replace(u=self._within(u, memory), e=e, runs=runs)
+        runs = memory.runs
+        if self.design.levels:
+            on, runs = u > self.switches, np.zeros(len(u)) if runs is None else runs
+            runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
+            runs = np.clip(runs, -LONG, LONG).astype(np.int64)
+        return memory._replace(u=u, e=e, runs=runs, ahead=ahead)
 
     def _within(self, u: Array, memory: Memory) -> Array:
         """Return inputs within their bounds, as known signals have them now."""
@@ -387,12 +390,12 @@ class Law:
             want = f"set-points of {', '.join(outputs)}"
             raise QPError.expected("r", "None in the first step", want)
         r = (last if len(last) else np.zeros(len(outputs))) if r is None else r
-        free = [i for i in range(len(outputs)) if i not in self.design.weighted]
-        if isinstance(r, Mapping) and free:
-            r = {**dict.fromkeys([outputs[i] for i in free], 0.0), **r}
+        unweighted = {*range(len(outputs))} - {*self.design.weighted}
+        if isinstance(r, Mapping):
+            r = {**dict.fromkeys([outputs[i] for i in unweighted], 0.0), **r}
         table = self.read("r", r, rows, sane=sane)
-        if free:
-            table[:, free] = np.where(self._are_plausible(table, 0), table, 0.0)[:, free]
+        for i in unweighted:
+            table[:, i] = np.where(self._are_plausible(table, 0)[:, i], table[:, i], 0.0)
         return table
 
     def read(self, name: str, value: Any, rows: int, least: int = 1, sane: bool = True) -> Array:

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.linalg import solve_discrete_lyapunov
 
-from torch_qpmpc.control.design import Design
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.design import Design, Target
+from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import Tables
@@ -118,10 +118,10 @@ def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, 
     signals = torch.cat((torch.zeros_like(signals[:1]), signals))
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
     s = torch.cat((r, w, r.new_zeros(len(r), n_d), r.new_ones(len(r), 1)), -1)
-    state = torch.cat((s.new_zeros(len(s), mpc.anchors), s), -1)
+    state = torch.cat((s.new_zeros(len(s), design.steady.anchors), s), -1)
     v = state @ torch.from_numpy(target.K.T) + torch.from_numpy(target.k)
     lam = s.new_zeros(len(s), len(mpc.targets.quadratic_program().lb))
-    aimed = mpc.steady_state(v, s, lam)
+    aimed = design.steady_state(torch, v, s, lam)
     stages = aimed
     if design.staged:
         stages = Target(*(part[:, None].expand(-1, mpc.horizon + 1, -1) for part in aimed))

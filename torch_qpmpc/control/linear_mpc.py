@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_whole
 from torch_qpmpc.control.design import (
     Design,
+    Target,
     read_bounds,
     read_limits,
     read_moves,
@@ -27,7 +28,7 @@ from torch_qpmpc.control.design import (
     within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
-from torch_qpmpc.control.lowering import ROUNDS, anchored, followed, lowered, target_mpc
+from torch_qpmpc.control.lowering import aimed, lowered, target_mpc
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
@@ -36,19 +37,6 @@ from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
 from torch_qpmpc.mpc.state import KIND, check_own, stored
-
-
-class Target(NamedTuple):
-    """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``.
-
-    The plan weighs the set-points r ``(*batch, n_y)``, see `Design.weighed`.
-    """
-
-    x: Tensor
-    u: Tensor
-    y: Tensor
-    r: Tensor
-
 
 #: The options of a plan's `QPMPC`.
 OPTIONS = {"structure": "tied", "learn": (), "solver": "daqp"}
@@ -108,8 +96,8 @@ class LinearMPC:
     Attributes:
         design: the `Design` of the arguments.
         plan: the `QPMPC` of the plan, with V, Q, the policy and what is learned.
-        targets: the QPMPC whose policy maps [f_0; r; w; d; 1] to the target, and anchors: the
-            length of f_0; see `torch_qpmpc.control.lowering`.
+        targets: the QPMPC whose policy maps [f_0; r; w; d; 1] to the target; see
+            `torch_qpmpc.control.lowering`.
 
     Raises:
         QPError: an argument is invalid, or nothing has a cost.
@@ -194,7 +182,7 @@ class LinearMPC:
     def _start(self, design: Design, options: dict[str, Any]) -> None:
         """Make the QPs; those of the target are not learned."""
         self.design, self.plan = design, QPMPC(lowered(design), **{**OPTIONS, **options})
-        self.targets, self.anchors = target_mpc(design), anchored(design)
+        self.targets = target_mpc(design)
         self._target_qp = self.targets.quadratic_program()
 
     @property
@@ -288,20 +276,12 @@ class LinearMPC:
         batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts.values()))
         r, w, known = _expanded(parts, zip(sizes), batch)
         s = torch.cat((r, w, known - nominal, r.new_ones(*batch, 1)), -1)
-        now = s.new_zeros(*batch, self.anchors), None
-        for _ in range(ROUNDS):
-            solution = self.targets.solve(torch.cat((now[0], s), -1), qp=self._target_qp)
-            v = self.targets.predicted(solution.z)[1][..., 0, :]
-            if (now := followed(v[..., v.shape[-1] - self.anchors :], *now)) is None:
-                break
-        return self.steady_state(v, s, solution.lam)
 
-    def steady_state(self, v: Tensor, s: Tensor, lam: Tensor) -> Target:
-        """Return the `Target` of ``v``, ``s = [r; w; d; 1]`` and the multipliers ``lam``."""
-        r, loads = s.tensor_split([len(self.design.Q)], -1)
-        maps = self.design.steady.maps
-        x, u, y = (v @ s.new_tensor(Z.T) + loads @ s.new_tensor(M.T) for Z, M in maps)
-        return Target(x, u, y, self.design.weighed(torch, r, y, lam))
+        def solve(state: Tensor) -> tuple[Tensor, Tensor]:
+            solution = self.targets.solve(state, qp=self._target_qp)
+            return solution.z, solution.lam
+
+        return aimed(self.design, torch, solve, s)
 
     def arrange(self, x: Any, target: Target, **signals: Any) -> Tensor:
         """Return p ``(*batch, n_p)`` in float64.
@@ -325,7 +305,7 @@ class LinearMPC:
         shapes = [[n], [*stages, n_d], [m]]
         shapes += [[*stages * design.staged, size] for size in (n, m, n_y, n_y)]
         x, known, u_last, *steady = _expanded(values, shapes, torch.as_tensor(x).shape[:-1])
-        return design.arranged(torch, x, steady, u_last, known)
+        return design.arranged(torch, x, Target(*steady), u_last, known)
 
 
 def _expanded(
@@ -352,27 +332,21 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
         QPError: one is invalid, or has another name.
     """
     y, u = plant.outputs, plant.inputs
-    readers: dict[str, Callable[[str, Any], Any]] = {
-        "Q": lambda name, value: read_weight(name, value, y),
-        "R": lambda name, value: read_weight(name, value, u),
-        "dR": lambda name, value: read_weight(name, value, u),
-        "y_slack": lambda name, value: read_wished(name, value, y),
-        "y_bounds": lambda name, value: read_bounds(name, value, y),
-        "u_bounds": lambda name, value: read_bounds(name, value, u),
-        "du_bounds": lambda _, value: read_moves(value, u),
-        "u_target": lambda name, value: read_said(name, value, u),
-        "violation": lambda name, value: read_said(name, value, y),
-    }
+    readers: dict[str, Any] = {"Q": (read_weight, y), "R": (read_weight, u), "dR": (read_weight, u)}
+    readers |= {"y_bounds": (read_bounds, y), "u_bounds": (read_bounds, u)}
+    readers |= {"du_bounds": (read_moves, u), "y_slack": (read_wished, y)}
+    readers |= {"u_target": (read_said, u), "violation": (read_said, y)}
     check_keywords("redesign", wishes, [*readers])
     limits = {} if old is None else old.limits
     for name, value in wishes.items():
         if old is not None and isinstance(value, Mapping):
-            wishes[name] = old.merged(name, value)
+            wishes[name] = old.merged(name, value, readers[name][1])
         if name in ("y_bounds", "u_bounds"):
-            names = y if name == "y_bounds" else u
+            names = readers[name][1]
             wishes[name], own = read_limits(name, wishes[name], names, plant)
             limits = {key: pair for key, pair in limits.items() if key not in names} | own
-    return {name: readers[name](name, x) for name, x in wishes.items()} | {"limits": limits}
+    read = {k: readers[k][0](k, value, readers[k][1]) for k, value in wishes.items()}
+    return read | {"limits": limits}
 
 
 def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:

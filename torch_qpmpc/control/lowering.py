@@ -23,6 +23,7 @@ that it moves no output off r would cost numbers in C their digits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ import scipy.linalg
 import torch
 from scipy.linalg import block_diag
 
-from torch_qpmpc.control.design import Design
+from torch_qpmpc.control.design import Design, Target
 from torch_qpmpc.control.disturbance import RANK, null_direction, unseen_modes
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
@@ -214,9 +215,21 @@ def _bounds(design: Design) -> Bounds:
     )
 
 
-def anchored(design: Design) -> int:
-    """Return the length of f_0: that of f if outputs have a weight."""
-    return len(design.steady.W) if design.steady.n_a else 0
+def aimed(design: Design, arrays: Any, solve: Callable[[Any], tuple[Any, Any]], s: Any) -> Target:
+    """Return the target for ``s = [r; w; d; 1]``, ``(*batch, n_s)``, in ``torch`` or ``np`` arrays.
+
+    ``solve`` maps [f_0; s] to z and the multipliers of the target's QP.
+    """
+    n_f = design.steady.anchors
+    now, state = (s[..., -1:] * arrays.zeros(n_f), None), s
+    for _ in range(ROUNDS):
+        if n_f:
+            state = arrays.concatenate((now[0], s), -1)
+        z, lam = solve(state)
+        v = z[..., state.shape[-1] : -state.shape[-1]]
+        if not n_f or (now := followed(v[..., -n_f:], *now)) is None:
+            break
+    return design.steady_state(arrays, v, s, lam)
 
 
 def followed(f: Any, f_0: Any, before: Any = None) -> tuple[Any, Any] | None:
@@ -236,7 +249,7 @@ def followed(f: Any, f_0: Any, before: Any = None) -> tuple[Any, Any] | None:
 
 def target_mpc(design: Design) -> QPMPC:
     """Return the QPMPC whose policy maps [f_0; r; w; d; 1] to v."""
-    steady, n_y, n_f = design.steady, len(design.Q), anchored(design)
+    steady, n_y, n_f = design.steady, len(design.Q), design.steady.anchors
     n_r, n_x = n_f + n_y, n_f + n_y + steady.y.shape[1]
     # y_s - r and u_s as maps of [f_0; r; w; d; 1; v].
     error = np.hstack((-np.eye(n_y, n_r, n_f), steady.y, steady.Y))

@@ -207,4 +207,5 @@ def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
     for _ in range(design.horizon):
         usual = np.maximum(usual, np.abs(plant.C @ x).max(1))
         x = plant.A @ x
-    return ABSURD * usual, ABSURD * np.where(plant.E.any(0), design.scaling.d, np.inf)
+    of_d = np.where(plant.E.any(0), ABSURD * design.scaling.d, np.finfo(float).max)
+    return ABSURD * usual, of_d

@@ -10,11 +10,11 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
-from torch_qpmpc.control.design import DECIDES, Design
+from torch_qpmpc.control.design import DECIDES, Design, Target
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
-from torch_qpmpc.control.linear_mpc import LinearMPC, Target
+from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.simulation import centre, last_known, simulate
 from torch_qpmpc.control.state_space import Array
@@ -218,8 +218,8 @@ def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
     ahead = np.tile(known, (len(x), mpc.horizon + 1, 1))
     p = mpc.arrange(x, target, u_last=u_last, known=ahead)
     status = solve_qp(mpc.plan.quadratic_program(), p, solver="daqp", on_failure="mask").status
-    hard = design.bounded[0] & np.isinf(design.y_slack)
-    names = ", ".join(name for name, x in zip(design.plant.outputs, hard, strict=True) if x)
+    hard = [i for i in design.bounded[0] if np.isinf(design.y_slack[i])]
+    names = ", ".join(design.plant.outputs[i] for i in hard)
     failed = (status == Status.INFEASIBLE).nonzero().flatten().tolist()
     if not failed:
         text = f"Plans exist with outputs up to {LARGEST:g} half ranges off their set-points."

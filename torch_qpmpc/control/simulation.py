@@ -13,7 +13,7 @@ from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals
 from torch_qpmpc.control.scaling import FAINT, Scaling
-from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_row, read_vector
+from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_table, read_vector
 from torch_qpmpc.errors import QPError, SolverError
 
 if TYPE_CHECKING:
@@ -81,9 +81,9 @@ def simulate(
     law: Law, memory: Memory, plant: Any, steps: int, r: Any, *, u: Any = None, **options: Any
 ) -> Run:
     """Return a closed loop; see `Controller.simulate`."""
-    last = memory.rest[1] if u is None else read_row("u", u, law.design.plant.inputs)
+    last = memory.rest[1] if u is None else read_table("u", u, law.design.plant.inputs, 1)[0]
     begun = law.begun(last, not hasattr(plant, "reset"))
-    options |= {"near": 1.0 if u is None else FAINT}
+    options["near"] = 1.0 if u is None else FAINT
     loop = closed_loop(law, memory, plant, steps, r, begun.u, law.policy(begun), **options)
     signals, moves, following = zip(*loop, strict=True)
     y, r, d = ([getattr(x, name) for x in signals] for name in ("y", "r", "known"))

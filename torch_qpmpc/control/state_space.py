@@ -170,17 +170,8 @@ def _check_absent(why: str, **arguments: Any) -> None:
             raise QPError.expected(name, repr(value), f"None, as {why}")
 
 
-def read_row(name: str, value: Any, names: Sequence[str]) -> Array:
-    """Return one number for each name, from a mapping, a vector or, for one name, a number.
-
-    Raises:
-        QPError: a name is missing or unknown, or a number is not finite.
-    """
-    return read_table(name, value, names, 1)[0]
-
-
 def read_measured(name: str, value: Any, names: Sequence[str]) -> Array:
-    """Return one number for each name as `read_row`, NaN where it is None or all are.
+    """Return one number for each name as `read_table`, NaN where it is None or all are.
 
     Raises:
         QPError: a name is missing or unknown, or the shape is wrong.
@@ -226,6 +217,8 @@ def read_table(
         raise QPError.expected(name, "NaN or inf", "finite numbers")
     if 1 < len(table) < least:
         raise QPError.expected(name, f"{len(table)} rows", f"one row, or at least {least}")
+    if len(table) == 1:
+        return table.repeat(rows, 0)
     return table[np.minimum(np.arange(rows), len(table) - 1)]
 
 

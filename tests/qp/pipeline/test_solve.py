@@ -224,6 +224,12 @@ def test_qps_at_rest_have_the_solutions_of_a_batch(seed, units):
                 assert np.abs(one - other).max() <= 1e-9 * (1 + np.abs(other).max())
     assert (log.solves, log.unsolved) == (20, int((~batch.solved).sum()))
     assert log.recalled > 0
+    rest = at_rest(known)
+    for _ in range(2):  # from empty sets, and from the last ones
+        together = rest.solve(known.fixed.numpy())
+        assert together.status.tolist() == batch.status.tolist()
+        value = batch.value.numpy()[together.status == 0]
+        assert np.allclose(together.value[together.status == 0], value, rtol=1e-9, atol=1e-9)
 
 
 def test_a_cost_that_is_not_convex_has_no_solution_at_rest():

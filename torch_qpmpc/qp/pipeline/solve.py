@@ -165,7 +165,7 @@ def report(status: np.ndarray, batch: torch.Size, on_failure: str) -> None:
 
 
 class AtRest:
-    """QPs of a theta at rest, solved one after the other.
+    """QPs of a theta at rest, solved call by call.
 
     QPs that this leaves unsolved take the ordinary steps. ``n_f`` is the number of fixed entries of
     z, ``n_kept`` that of `Programs.of`.
@@ -179,36 +179,34 @@ class AtRest:
         self._is_sound = self._of(np.zeros((1, n_f))).scaled().solvable() is None
 
     def solve(self, fixed: np.ndarray, warm: bool = True) -> BatchSolution:
-        """Solve and certify the QP with the fixed entries ``(1, n_f)``, in float64.
-
-        It starts from the last active set if it is ``warm``, else from the empty one.
-        """
-        self._active = self._active if warm else np.zeros_like(self._active)
+        """Solve QPs with the fixed entries ``(B, n_f)``, from the last active sets if ``warm``."""
+        if not warm or len(fixed) != len(self._active):
+            self._active = np.zeros((len(fixed), self._active.shape[1]), np.int8)
         began, programs, log = time.perf_counter(), self._of(fixed), _active_log.get(None)
         if (solution := self._recalled(programs)) is None:
             solution = solve_programs(programs, self.solver)
-            if not solution.status[0]:  # of one set, the solution is the same whatever led to it
+            if not any(solution.status):  # of one set, the solution is the same whatever led to it
                 self._active = solution.active
                 solution = self._recalled(programs) or solution
         elif log is not None:
-            log.recalled += 1
+            log.recalled += len(fixed)
             log.add(solution, time.perf_counter() - began)
         return solution
 
     def _recalled(self, programs: Programs) -> BatchSolution | None:
-        """Return the certified solution of the last active set, corrected where needed, if any."""
+        """Return certified solutions of the last active sets, if these settle."""
         if not self._is_sound:
             return None
         solution, units = programs.scaled().recalled(self._active), self.prepared.units
         if units is not None:
             solution = units.restored(solution, programs.group)
-        if solution.status[0]:
+        if any(solution.status):
             return None
         self._active = solution.active
         return solution
 
     def _of(self, fixed: np.ndarray) -> Programs:
-        return Programs(self.prepared, np.zeros(1, np.int64), fixed)
+        return Programs(self.prepared, np.zeros(len(fixed), np.int64), fixed)
 
 
 #: A step maps QPs without a certified solution, and their best candidates so far, to candidates;
