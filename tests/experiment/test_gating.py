@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 import train
 from tests.runs import SMALL, make_config
+from torch_qpmpc import QPMPC
 from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
 from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
@@ -61,7 +62,7 @@ def test_without_a_gate_the_learner_acts(tmp_path):
     assert gate.judge(4) == gate.summary() == {}
     assert gate.state_dict() is None
     gate.save(tmp_path)
-    assert not (tmp_path / BEST).exists()
+    assert torch.equal(QPMPC.load(tmp_path / BEST).C, gate.mpc.C)
 
 
 def test_a_candidate_that_got_worse_is_not_kept():

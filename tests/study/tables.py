@@ -14,5 +14,6 @@ def made_up(gaps: dict[tuple[str, str], list[float]]) -> pd.DataFrame:
             row |= {"closed_gap": gap, "real": seed < len(values), "canonical_distance": 0.1 * seed}
             row |= {"prediction_error": 0.02 * seed, "prediction_error_start": 0.05}
             row |= {"J_start": 285.04, "J_best": 50.0, "J_true_model": 46.97, "zeros_above": 1.0}
+            row["radius"] = 0.9
             rows.append(row)
     return pd.DataFrame(rows)

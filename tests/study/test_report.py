@@ -22,6 +22,12 @@ def test_a_case_is_a_row_with_median_interval_and_both_ends():
     assert si == f"| si, brownian | - (0 of 1) | {ends} | 0.100 | 1.00 | 0.050 to 0.020 (1 of 1) |"
 
 
+def test_a_loop_that_is_unstable_with_the_true_plant_is_said_to_be():
+    frame = made_up({("gaussian", "free"): [0.9] * 3})
+    frame.loc[1, "radius"] = 1.217
+    assert "(2 of 3); 1 unstable, radius 1.217 |" in report.cases_table(frame)
+
+
 def test_fewer_than_six_runs_have_a_range():
     frame = made_up({("gaussian", case): [0.7, 0.9, 0.8, 0.1] for case in report.CASES})
     assert "| 0.800 (range of 3: 0.700 to 0.900) (3 of 4) |" in report.cases_table(frame)

@@ -67,6 +67,15 @@ def test_readings_do_not_depend_on_the_gauge(study):
     assert math.isnan(run.readings()["prediction_error"]), "it determines no states"
 
 
+def test_the_radius_is_that_of_the_true_plant_at_the_origin(study):
+    run = FinishedRun(study / "small" / "gaussian-free-seed1")
+    A, B, _ = run.physics.true_model()
+    with torch.no_grad():
+        slope = run.policy.policy(1e-4 * torch.eye(4).to(A)).mT / 1e-4
+    radius = torch.linalg.eigvals(A + B @ slope).abs().max().item()
+    assert run.readings()["radius"] == pytest.approx(radius, rel=1e-5)
+
+
 def test_the_models_error_is_that_of_one_step(study):
     """An offset of 0.3 in one state gives an error of 0.3, a gain of 1 the state's spread."""
     physics = FinishedRun(study / "small" / "gaussian-free-seed1").physics

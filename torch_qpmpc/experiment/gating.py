@@ -100,9 +100,8 @@ class RunGate:
         return decisions | {COMPARED[self._cfg.gate == "plant"]: self.compared}
 
     def save(self, folder: Path) -> None:
-        """Write the policy that is kept to best.pt; without a gate, the checkpoint has it."""
-        if self._gate is not None:
-            self.mpc.save(folder / BEST)
+        """Write the policy that is kept to best.pt."""
+        self.mpc.save(folder / BEST)
 
     def state_dict(self) -> dict[str, Any] | None:
         """Return the state of the gate; None without one."""

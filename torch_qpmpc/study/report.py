@@ -30,8 +30,9 @@ from torch_qpmpc.study.statistics import interquartile_mean, spread
 SIDE_BY_SIDE = 8
 CAPTION = f"""\
 Closed gap: median and 95% interval (bootstrapped over seeds; the range of fewer than six) of the
-runs with a real gap, J_start - J_true_model >= {REAL_GAP:g} J_start, and their number. All other
-entries are medians over all runs.
+runs with a real gap, J_start - J_true_model >= {REAL_GAP:g} J_start, and their number; unstable are
+runs whose loop with the true plant has a spectral radius above 1 at the origin. All other entries
+are medians over all runs.
 J: start to learned, with the true model in brackets. Distance: relative distance of C's predictions
 from those of the nearest time-invariant MPC scheme. Zeros: share of C's entries above the band that
 are exactly zero. Prediction error: root mean square over one step, of the corrupted (A, B) and of
@@ -44,6 +45,8 @@ def cases_table(sweep: pd.DataFrame) -> str:
     for _, runs in sweep.groupby(["noise", "label"], sort=False):
         real = runs.query("real")["closed_gap"].to_numpy()
         gap = f"{np.median(real):.3f} {spread([real]).text()}" if len(real) else "-"
+        loose = runs.query("radius > 1")["radius"]
+        shown = f"; {len(loose)} unstable, radius {loose.max():.3f}" if len(loose) else ""
         median: Any = runs.median(numeric_only=True)
         start, best, true = (cost_text(median[f"J_{x}"]) for x in ("start", "best", "true_model"))
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
@@ -51,7 +54,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
         lines.append(
             [
                 escaped(f"{runs['label'].iloc[0]}, {runs['noise'].iloc[0]}"),
-                f"{gap} ({len(real)} of {len(runs)})",
+                f"{gap} ({len(real)} of {len(runs)}){shown}",
                 f"{start} to {best} ({true})",
                 f"{median['canonical_distance']:.3f}",
                 f"{median['zeros_above']:.2f}",

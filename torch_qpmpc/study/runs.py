@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from torch_qpmpc.analysis.policy import local_gain, spectral_radius
 from torch_qpmpc.analysis.structure import (
     NearestModel,
     nearest_model,
@@ -99,14 +100,9 @@ class FinishedRun:
         """The run's configuration."""
         return read_config(self.folder)
 
-    @property
-    def has_plant(self) -> bool:
-        """False if the plant takes code that the configuration names and that has not run."""
-        return has_run(self.cfg.task)
-
     @cached_property
     def physics(self) -> AnyPlant:
-        """The plant, if `has_plant`."""
+        """The plant; `QPError` if it takes code that has not run."""
         plant = make_physics(self.cfg)
         return plant if isinstance(plant, LinearSystem) else plant.observed(self.observer)
 
@@ -123,7 +119,7 @@ class FinishedRun:
     @cached_property
     def true(self) -> QPMPC | None:
         """The QP with the true model; None if that is unknown."""
-        return make_true_mpc(self.cfg, self.physics) if self.has_plant else None
+        return make_true_mpc(self.cfg, self.physics) if has_run(self.cfg.task) else None
 
     @cached_property
     def policy(self) -> QPMPC:
@@ -141,20 +137,24 @@ class FinishedRun:
         return read_metrics(self.folder)
 
     def readings(self) -> dict[str, float]:
-        """Read the share of zeros above C's band and the errors of learned and first model.
+        """Return the zeros above C's band, a spectral radius, errors of learned and first model.
 
-        The errors are nan if the constraints do not determine the states or the true model is
-        unknown.
+        ``zeros_above`` is a share, ``radius`` that of the policy's loop at the origin with the true
+        plant, nan if that does not rest there. The errors are nan if the constraints do not
+        determine the states. Without a true model all but the zeros are nan.
         """
         above = band_distance(self.policy.layout) > 0
         zeros = (self.policy.C[above] == 0).double().mean().item()
-        errors = math.nan, math.nan
-        if self.has_plant and isinstance(physics := self.physics, LinearSystem):
+        errors, radius = (math.nan, math.nan), math.nan
+        if has_run(self.cfg.task) and isinstance(physics := self.physics, LinearSystem):
+            A, B, offset = physics.true_model()
+            if not offset.any():
+                radius = spectral_radius(A, B, local_gain(self.policy, 0 * offset)).item()
             with contextlib.suppress(QPError):
                 forms = predictions(self.policy), predictions(self.start)
                 errors = tuple(prediction_error(nearest_model(form), physics) for form in forms)
-        names = ("zeros_above", "prediction_error", "prediction_error_start")
-        return dict(zip(names, (zeros, *errors), strict=True))
+        names = ("zeros_above", "radius", "prediction_error", "prediction_error_start")
+        return dict(zip(names, (zeros, radius, *errors), strict=True))
 
 
 def prediction_error(model: NearestModel, physics: LinearSystem) -> float:
@@ -198,9 +198,7 @@ def collect(folder: str | Path) -> pd.DataFrame:
     if not rows:
         got = f"{folder}, without a finished run"
         raise QPError.expected("RUNS_FOLDER", got, "a folder that train.py wrote to")
-    frame = pd.DataFrame(rows)
-    for name in NUMBERS:  # null without a gap or a true model
-        frame[name] = frame[name].astype(float)
+    frame = pd.DataFrame(rows).astype(dict.fromkeys(NUMBERS, float))  # null: no gap, or true model
     frame["real"] = frame["J_start"] - frame["J_true_model"] >= REAL_GAP * frame["J_start"].abs()
     frame["label"] = ""
     for _, sweep in frame.groupby("sweep"):
@@ -220,11 +218,9 @@ def _labels(sweep: pd.DataFrame) -> list[str]:
     keys = keys[[x for x in keys if x not in _UNLABELLED and not x.startswith("noise.")]]
     varied = keys.groupby(sweep["constraint"]).nunique() > 1
     labels = []
-    for row, case, ablation in zip(
-        sweep.index, sweep["constraint"], sweep["ablation"], strict=True
-    ):
+    for row, (case, ablation) in sweep[["constraint", "ablation"]].iterrows():
         own = keys.loc[row][varied.loc[case]].dropna().items()
         details = [f"{str(key).split('.')[-1]}={x}" for key, x in own]
-        parts = [case, *(details if ablation is None else [ablation])]
+        parts = [case, *(details if pd.isna(ablation) else [ablation])]
         labels.append(", ".join(parts).replace("$", ""))  # a $ begins mathematics in a figure
     return labels
