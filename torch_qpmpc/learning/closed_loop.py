@@ -29,7 +29,7 @@ from torch_qpmpc.identification.log import Trajectory, folds
 from torch_qpmpc.identification.subspace import fit_state_space
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.parametrizations import Tied
+from torch_qpmpc.mpc.parametrizations import Tied, make_hessian
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.validation import check_no_levels
 
@@ -298,7 +298,7 @@ def stage_cost(scheme: Scheme) -> Callable[[Tensor, Tensor], Tensor]:
         (torch.arange(layout.n_d), torch.arange(layout.n_preview, layout.n_p + layout.n_u))
     )
     one = torch.ones(layout.n_z, dtype=torch.float64)
-    H = layout.hessian(scheme.cost.hessian, theta["H"], theta["H_f"], one)[kept][:, kept]
+    H = make_hessian(layout, scheme.cost.hessian, theta["H"], theta["H_f"], one)[kept][:, kept]
     q = theta["q"][kept]
     G, lb, ub, w = (theta[name] for name in ("G", "lb", "ub", "w"))
     others = torch.ones(layout.n_z, dtype=torch.bool).index_fill(0, kept, False)

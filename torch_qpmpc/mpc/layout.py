@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
@@ -61,27 +62,27 @@ class Layout:
             object.__setattr__(self, name, int(size))
         object.__setattr__(self, "blocks", read_blocks(self.blocks, self.horizon))
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Entries of a stage of the plan, n_x + n_u."""
         return self.n_x + self.n_u
 
-    @property
+    @cached_property
     def n_preview(self) -> int:
         """Entries of all previews, (N + 1) n_d."""
         return (self.horizon + 1) * self.n_d
 
-    @property
+    @cached_property
     def n_p(self) -> int:
         """Entries of z that V fixes: all up to x_0."""
         return self.n_preview + self.n_x
 
-    @property
+    @cached_property
     def n_z(self) -> int:
         """Entries of z, known and planned."""
         return self.n_p + self.horizon * self.n
 
-    @property
+    @cached_property
     def n_linear(self) -> int:
         """Rows of D and D^f in G."""
         return self.horizon * self.n_mixed + self.n_terminal
@@ -184,31 +185,6 @@ class Layout:
         u = F.pad(repeating, (0, 0, 0, 1)).expand(-1, self.n_u)
         D_f = none.new_zeros(self.n_terminal)
         return self.rows(none, u, repeating & of_actions, D_f)
-
-    def hessian(self, kind: str, stages: Tensor, terminal: Tensor, discount: Tensor) -> Tensor:
-        """Return H ``(n_z, n_z)`` (eq:qpH) from the weights of the ``stages`` and ``terminal``.
-
-        Those of the ``kind`` "block" weight (d_k, x_k, u_k) and (d_N, x_N); a diagonal H has
-        entries for the plan only. ``discount`` has an entry for each of z.
-        """
-        if kind == "diagonal":
-            # Operations whose batched gradients (`GaussNewton`) are not a loop over the batch.
-            before, plan = stages.new_zeros(self.n_preview), stages.expand(self.horizon, self.n)
-            return torch.diag_embed(discount * torch.cat((before, plan.flatten(), terminal)))
-        root = discount.sqrt()
-        return root.unsqueeze(-1) * self.block_hessian(stages, terminal) * root
-
-    def block_hessian(self, stage: Tensor, terminal: Tensor) -> Tensor:
-        """Return H without discounts: ``stage`` of (d_k, x_k, u_k), one or N, and ``terminal``."""
-        n_d, size = self.n_d, self.n_d + self.n
-        blocks = (*stage.expand(self.horizon, size, size), terminal)
-        plan = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
-        if not n_d:
-            return plan
-        preview = torch.block_diag(*(block[:n_d, :n_d] for block in blocks))
-        cross = torch.block_diag(*(block[:n_d, n_d:] for block in blocks))
-        upper, lower = torch.cat((preview, cross), dim=-1), torch.cat((cross.mT, plan), dim=-1)
-        return torch.cat((upper, lower))
 
 
 def read_blocks(blocks: Sequence[int], horizon: int) -> tuple[int, ...]:

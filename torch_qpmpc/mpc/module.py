@@ -27,7 +27,14 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.nonlinear import PlanSolution, SequentialQP, at_origin
-from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, Masked, Tied, parametrizations_for
+from torch_qpmpc.mpc.parametrizations import (
+    SIGNED,
+    Banded,
+    Masked,
+    Tied,
+    make_hessian,
+    parametrizations_for,
+)
 from torch_qpmpc.mpc.projections import CHOLESKY, NEAREST, check_step
 from torch_qpmpc.mpc.scheme import GAMMA, KEYWORDS, MODELS, Scheme, check_names
 from torch_qpmpc.mpc.stage_cost import fit_rewards, scheme_cost
@@ -459,7 +466,7 @@ class QPMPC(nn.Module):
                 theta = parameters.moved(self, residuals)
             else:
                 theta = {part: getattr(self, part) for part in (*COST, *CONSTRAINTS)}
-            hessian = partial(self.layout.hessian, self.hessian, discount=self.discount)
+            hessian = partial(make_hessian, self.layout, self.hessian, discount=self.discount)
             weights = theta["H"], theta["H_f"]
             if residuals is None:
                 H = hessian(*weights)

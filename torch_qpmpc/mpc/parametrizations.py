@@ -47,6 +47,29 @@ def parametrizations_for(
     return chain
 
 
+def make_hessian(
+    layout: Layout, kind: str, stages: Tensor, terminal: Tensor, discount: Tensor
+) -> Tensor:
+    """Return H ``(n_z, n_z)`` (eq:qpH) from the weights of the ``stages`` and ``terminal``.
+
+    Those of the ``kind`` "block" weight (d_k, x_k, u_k), one or N, and (d_N, x_N); a diagonal H has
+    entries for the plan only. ``discount`` has an entry for each of z.
+    """
+    n_d, size = layout.n_d, layout.n_d + layout.n
+    if kind == "diagonal":
+        # Operations whose batched gradients (`GaussNewton`) are not a loop over the batch.
+        before, plan = stages.new_zeros(layout.n_preview), stages.expand(layout.horizon, layout.n)
+        return torch.diag_embed(discount * torch.cat((before, plan.flatten(), terminal)))
+    blocks = (*stages.expand(layout.horizon, size, size), terminal)
+    H = torch.block_diag(*(block[n_d:, n_d:] for block in blocks))
+    if n_d:
+        preview = torch.block_diag(*(block[:n_d, :n_d] for block in blocks))
+        cross = torch.block_diag(*(block[:n_d, n_d:] for block in blocks))
+        H = torch.cat((torch.cat((preview, cross), -1), torch.cat((cross.mT, H), -1)))
+    root = discount.sqrt()
+    return root.unsqueeze(-1) * H * root
+
+
 class SquareRoot(nn.Module):
     """The Cholesky factor of a diagonal: non-negative entries ``h = l * l``, any shape.
 

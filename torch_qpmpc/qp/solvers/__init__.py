@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
@@ -23,6 +23,7 @@ BACKENDS: dict[str, Backend] = {
 }
 
 
+@cache
 def backend(name: str) -> Backend:
     """Return the backend called ``name``; raise `QPError` if there is none."""
     if name in BACKENDS:
@@ -44,6 +45,7 @@ def backend(name: str) -> Backend:
 FALLBACKS = ("daqp", "torch")
 
 
+@cache
 def fallbacks(name: str) -> list[Backend]:
     """Return the backends that solve again, cold, the QPs for which ``name`` was rejected.
 
