@@ -192,10 +192,17 @@ def in_torch(p: Programs) -> tuple[Any, ...]:
     return group, fixed, *on_device(p.prepared, torch.device("cpu"), p.n_f)
 
 
+def within(lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
+    """Return lam within [-w, w], on the side of a bound, as candidates are before the judge."""
+    inside = torch.where(lam.isnan(), lam, lam.clamp(-w, w))
+    return torch.where(torch.where(lam > 0, ub.isinf(), (lam < 0) & lb.isinf()), 0.0, inside)
+
+
 def certified(p: Programs, *claim: Tensor, compiled: bool = True) -> tuple[Tensor, ...]:
     """Return value, residual and error of a value of the ``claim`` z, lam, chi, xi."""
     z, lam, chi, xi = claim
     group, _, theta, *_ = in_torch(p)
+    lam = within(lam, theta.lb, theta.ub, theta.w)
     Hz, y, Cz = (multiply(x, group, z) for x in (theta.H, theta.G, theta.C))
     G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
     left = Hz + theta.q + G_lam + C_chi

@@ -84,7 +84,9 @@ SPOILERS: dict[str, Callable[[KnownQP], dict[str, Tensor]]] = {
     "chi wrong": lambda known: {"chi": shifted(known.chi, 1, 1e-3)},
     "xi wrong": lambda known: {"xi": shifted(known.xi, 1, 1e-3)},
     "NaN in z": lambda known: {"z": shifted(known.z, 3, torch.nan)},
-    "infinite multiplier": lambda known: {"lam": shifted(known.lam, 3, torch.inf)},
+    "infinite multiplier": lambda known: {
+        "lam": shifted(known.lam, first_row(known, known.qp.w.isinf()), torch.inf)
+    },
 }
 
 

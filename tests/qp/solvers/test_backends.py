@@ -21,7 +21,7 @@ from tests.references import by_cvxpy, by_quadprog
 from torch_qpmpc import QPError, SolveLog, solve_qp
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_numpy
 from torch_qpmpc.qp.program import EVENT_SHAPES
-from torch_qpmpc.qp.solvers import BACKENDS, backend, fallbacks
+from torch_qpmpc.qp.solvers import BACKENDS, backend
 
 BATCHES = [((), ()), ((1,), ()), ((6,), ()), ((6,), (6,)), ((3, 4), (3, 1)), ((3, 4), (4,))]
 
@@ -223,13 +223,6 @@ def test_a_backend_answers_with_one_row_per_program(solver):
 def test_an_unknown_backend_is_named(name, message):
     with pytest.raises(QPError, match=message):
         backend(name)
-
-
-def test_a_backend_falls_back_on_others():
-    for name, solve in BACKENDS.items():
-        *others, last = fallbacks(name)
-        assert solve not in others
-        assert last is fallbacks("proxqp")[-1]  # whichever was first, it has the last word
 
 
 def test_rows_that_are_hard_in_some_of_a_batch_only(solver):

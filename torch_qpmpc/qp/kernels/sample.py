@@ -176,7 +176,9 @@ def _all_multipliers(lam_v, y, theta, rows, others):
         # A separate loop, which LLVM vectorises.
         for j in range(lam.shape[1]):
             force, weight = lam[i, j], w[i_w, j]
-            lam[i, j] = weight if force > weight else -weight if force < -weight else force
+            most = weight if ub[i_ub, j] < np.inf else 0.0
+            least = -weight if lb[i_lb, j] > -np.inf else 0.0
+            lam[i, j] = most if force > most else least if force < least else force
         for j in others:
             weight = w[i_w, j]
             if weight < np.inf:  # a violated hard row stays violated: the residual shows it
@@ -203,10 +205,9 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
 
     Returns:
         The value, the residual and the error of the value, ``(B,)``. The residual is the largest
-        error in stationarity, C z = b, the fixed entries, hard rows, and multipliers (outside
-        [-w, w] or at absent bounds), each relative to the size of its terms; or, if larger, the sum
-        of the errors in C z = b, weighted by |chi|, and of the rows' complementarity gaps, relative
-        to the cost.
+        error in stationarity, C z = b, the fixed entries and hard rows, each relative to the size
+        of its terms; or, if larger, the sum of the errors in C z = b, weighted by |chi|, and of the
+        rows' complementarity gaps, relative to the cost.
     """
     Hz, G_lam, C_chi, left, y, Cz = terms
     H, C, G = theta.H, theta.C, theta.G
@@ -230,7 +231,7 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         worst = max(steep / (1.0 + force), _short(Cz[i], b_i, C[m], z[i]))
         for j in range(n_f):
             worst = max(worst, abs(z[i, j] - fixed[i, j]))
-        worst = max(worst, _excess(y[i], lam[i], lb_i, ub_i, w_i, G[m], z[i]))
+        worst = max(worst, _violation(y[i], lb_i, ub_i, w_i, G[m], z[i]))
         worst = max(worst, gap / (1.0 + abs(cost)))
 
         scale = max(abs(cost), abs(linear), abs(quadratic), charge)
@@ -495,30 +496,20 @@ def _short(Cz, b, C, z):
 
 
 @compiled
-def _excess(y, lam, lb, ub, w, G, z):
-    """Return the largest violation of a hard row, of |lam| <= w, or of lam at an absent bound.
-
-    A violation is relative to the terms of its row, a multiplier to w.
-    """
-    error = violation = 0.0
+def _violation(y, lb, ub, w, G, z):
+    """Return the largest violation of a hard row, relative to the terms of its row."""
+    violation = 0.0
     for j in range(len(y)):
-        at, force, weight = y[j], lam[j], w[j]
-        above, below = ub[j], lb[j]
-        hard = weight == np.inf
-        over = max(at - above, below - at)
-        if hard and over > 0:
-            over /= _floor(below, above) + abs(at)
-        excess = (abs(force) - weight) / (1.0 + weight)
-        astray = max(force if above == np.inf else 0.0, -force if below == -np.inf else 0.0)
-        error = max(error, max(0.0 if hard else excess, astray))
-        violation = max(violation, over if hard else 0.0)
+        over = max(y[j] - ub[j], lb[j] - y[j])
+        if w[j] == np.inf and over > 0:
+            violation = max(violation, over / (_floor(lb[j], ub[j]) + abs(y[j])))
     if violation > CLOSE:
         violation = 0.0
         for j in range(len(y)):
             if w[j] == np.inf:
                 over, floor = max(y[j] - ub[j], lb[j] - y[j]), _floor(lb[j], ub[j])
                 violation = max(violation, over / (floor + _weighted(z, G[j])))
-    return max(error, violation)
+    return violation
 
 
 @compiled

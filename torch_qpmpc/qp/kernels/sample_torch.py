@@ -39,6 +39,7 @@ def recover(v, lam, iterations, group, fixed, theta, reduced, sizes) -> tuple[Te
     beyond = beyond * (beyond.abs() > (COSTLY / theta.w).clamp(max=VIOLATED))
     all_lam = beyond.sign() * theta.w.masked_fill(theta.w.isinf(), 0.0)
     all_lam[:, reduced.rows] = lam.clamp(-reduced.w, reduced.w)
+    all_lam = torch.where(all_lam > 0, theta.ub, -theta.lb).isinf().logical_not() * all_lam
     G_lam = multiply(theta.G.mT, group, all_lam)
     left = Hz + theta.q + G_lam
     chi = multiply(Y_neg.mT, group, left)
@@ -76,10 +77,7 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms) -> tuple[Tens
         left / (1.0 + largest(forces, keepdim=True)),
         short / (1.0 + theta.b.abs() + of_rows[2]),
         z[:, : fixed.shape[-1]] - fixed,
-        # A hard row's violation, and a soft row's multiplier beyond w.
-        torch.where(hard, outside / (near + of_rows[1]), (lam.abs() - w) / (1.0 + w)).clamp(min=0),
-        up * no_ub,
-        down * no_lb,
+        torch.where(hard, outside / (near + of_rows[1]), 0.0),
         (gap / (1.0 + cost.abs())).unsqueeze(-1),
     )
     slopes = multiply(reduced.T.mT, group, left)

@@ -31,8 +31,11 @@ from torch_qpmpc.qp.pipeline.device import accelerator, attempt
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
-from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, fallbacks
+from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend
 
+#: Backends that solve again, cold, what the chosen one leaves: they give up soonest, and solve all
+#: that ProxQP solves. The last is the same for each: none decides whether there is a solution.
+FALLBACKS = ("daqp", "torch")
 ON_FAILURE = ("raise", "warn", "mask")
 Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
@@ -272,7 +275,9 @@ def steps_of(
     Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
     them after other eliminations, which solve whole batches.
     """
-    first, *others, last = map(backed, (backend(solver), *fallbacks(solver)))
+    others = (name for name in FALLBACKS if name != solver or name == FALLBACKS[-1])
+    solves = BACKENDS.get(solver) or backend(solver), *map(BACKENDS.__getitem__, others)
+    first, *others, last = map(backed, solves)
     refined = partial(_refined, log)
     return [
         *([partial(attempt, device)] if device else []),

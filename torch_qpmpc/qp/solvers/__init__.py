@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
@@ -23,7 +23,6 @@ BACKENDS: dict[str, Backend] = {
 }
 
 
-@cache
 def backend(name: str) -> Backend:
     """Return the backend called ``name``; raise `QPError` if there is none."""
     if name in BACKENDS:
@@ -41,17 +40,4 @@ def backend(name: str) -> Backend:
     )
 
 
-#: Solvers that give up soonest, and solve every QP that ProxQP solves.
-FALLBACKS = ("daqp", "torch")
-
-
-@cache
-def fallbacks(name: str) -> list[Backend]:
-    """Return the backends that solve again, cold, the QPs for which ``name`` was rejected.
-
-    The last is the same for each, so that none decides whether a QP has a solution.
-    """
-    return [BACKENDS[other] for other in FALLBACKS if other != name or other == FALLBACKS[-1]]
-
-
-__all__ = ["BACKENDS", "Backend", "BackendSolution", "backend", "fallbacks"]
+__all__ = ["BACKENDS", "Backend", "BackendSolution", "backend"]
