@@ -11,14 +11,16 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "docs" / "examples" / "torchrl"
 pytestmark = [
     pytest.mark.skipif(not FOLDER.exists(), reason="no docs, as in a wheel's tests"),
-    pytest.mark.filterwarnings("ignore:The env passed to Collector"),
+    pytest.mark.filterwarnings("ignore:The env passed to Collector", "ignore:.*rewards"),
 ]
 
 
+@pytest.mark.parametrize("id", [None, "Pendulum-v1"])
 @pytest.mark.parametrize(("name", "updates"), [("ddpg", 3), ("td3", 3), ("sac", 3), ("ppo", 1)])
-def test_a_script_of_at_most_60_lines_learns(name, updates):
+def test_a_script_of_at_most_60_lines_learns(monkeypatch, name, updates, id):
+    monkeypatch.syspath_prepend(FOLDER)
     path = FOLDER / f"{name}.py"
     assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
-    before, after = runpy.run_path(str(path))["main"](updates)
+    before, after = runpy.run_path(str(path))["main"](updates, id=id)
     assert math.isfinite(after)
     assert after != before

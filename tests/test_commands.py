@@ -39,7 +39,6 @@ STOPPED = (
     f"wait $! && exit 1; {LONG}"
 )
 PENDULUM = "python train.py task=gymnasium task.id=Pendulum-v1 start=data"
-SCRIPT = "import runpy; print(runpy.run_path('docs/examples/torchrl/ddpg.py')['main'](2, seed=71))"
 
 
 class Short(NamedTuple):
@@ -116,7 +115,8 @@ SHORT = {
     ),
     "python my_task.py -m task=pole solver=daqp seed=1,2,3": Short(SWEEP, files=MY_TASK),
     "python docs/examples/heat_pump.py heat_pump.png": Short(),
-    "python docs/examples/torchrl/ddpg.py": Short(instead=f'python -c "{SCRIPT}"'),
+    "python docs/examples/torchrl/ddpg.py": Short("--updates 2 --seed 71"),
+    "python docs/examples/torchrl/sac.py --id Pendulum-v1": Short("--updates 2 --seed 71"),
     # Benchmarks that can be shortened: one row of each.
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
     "python -m tests.benchmarks.closed_loops --seeds 16 17 18 19 20": Short(

@@ -1,8 +1,9 @@
-"""TD3 with a QP as actor and two more as critics, on the paper's point mass."""
+"""TD3 with a QP as actor and two more as critics, on the paper's point mass or `--id ID`."""
 
 import copy
 
 import torch
+from plants import options, start
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -10,33 +11,26 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 import torch_qpmpc as qm
-from torch_qpmpc.envs.closed_loop import closed_loop
-
-PLANT = qm.envs.PointMass()
 
 
-def main(updates: int = 1500, seed: int = 1) -> tuple[float, float]:
+def main(updates: int = 1500, seed: int = 1, id: str | None = None) -> tuple[float, float]:
     """Learn; return J before and after."""
-    torch.manual_seed(seed)
-    A, B, weight = PLANT.corrupted(seed)  # a wrong model and a random cost
-    weight = torch.cat((weight, torch.tensor([0.1, 0.1])))
-    options = {"action_bounds": (PLANT.lb_a, PLANT.ub_a), "gamma": 0.9, "learn": ("H", "c", "C")}
-    mpc = qm.QPMPC.from_model(A, B, 10, stage_weight=weight, solver="daqp", **options)
-    before = closed_loop(mpc.policy, PLANT).J
+    env, mpc, J, (low, high) = start(id, seed)
+    before = J(mpc.policy)
 
     actor = qm.QPActorValueOperator(mpc).get_policy_operator()
     critics = [qm.QPActorValueOperator(copy.deepcopy(mpc)) for _ in range(2)]
     with torch.no_grad():
         critics[1].module.C.mul_(1.01)  # they must not be the same
-    loss = TD3Loss(actor, critics, bounds=(-1.0, 1.0), loss_function="l2")
-    loss.make_value_estimator(gamma=0.9)
+    loss = TD3Loss(actor, critics, bounds=(low, high), loss_function="l2")
+    loss.make_value_estimator(gamma=mpc.gamma)
     target = SoftUpdate(loss, tau=0.01)
     groups = mpc.parameter_groups({"cost": 2e-3, "constraints": 2e-4})
     groups += [{"params": [*loss.qvalue_network_params.parameters()], "lr": 5e-3}]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95))
 
-    env = PLANT.vectorised(16, 50, seed=seed)
-    noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.3, sigma_end=0.3)
+    size = 0.15 * (high - low).mean().item()
+    noise = AdditiveGaussianModule(env.action_spec, sigma_init=size, sigma_end=size)
     frames = {"frames_per_batch": 16, "total_frames": 16 * updates}
     collector = Collector(env, TensorDictSequential(actor, noise), **frames)
     replay = ReplayBuffer(storage=LazyTensorStorage(16_000), batch_size=64)
@@ -48,8 +42,8 @@ def main(updates: int = 1500, seed: int = 1) -> tuple[float, float]:
         optimizer.step()
         target.step()
     collector.shutdown()
-    return before, closed_loop(mpc.policy, PLANT).J
+    return before, J(mpc.policy)
 
 
 if __name__ == "__main__":
-    print("J before: {:.2f}, after: {:.2f}".format(*main()))
+    print("J before: {:.2f}, after: {:.2f}".format(*main(**options())))
