@@ -24,6 +24,14 @@ DESIGN: dict[str, Any] = {
     "du_bounds": {"p": (-0.5, 0.5), "q": (-0.4, 0.6)},
     "y_slack": {"a": 50.0, "b": 70.0},
     "u_target": {"p": 0.1, "q": 0.2},
+    "constraints": {
+        "power": ({"p": 1.0, "q": 0.5}, (None, 1.2)),
+        "sum": ({"a": 1.0, "b": 1.0, "p": 0.1}, (-3.0, 3.0), 40.0),
+    },
+    "terminal_constraints": {
+        "end": ({"a": 1.0, "b": -1.0}, (-1.0, 1.0)),
+        "top": ({"a": 1.0}, (0.0, 1.0)),
+    },
 }
 FILTER: dict[str, Any] = {
     "noise": {"a": 0.01, "b": 0.02},
@@ -39,6 +47,8 @@ CHANGES: dict[str, Any] = {
     "du_bounds": (-0.1, 0.1),
     "y_slack": 90.0,
     "u_target": 0.3,
+    "constraints": ({"q": 1.0, "a": 1.0}, (-1.0, 2.0), 30.0),
+    "terminal_constraints": ({"a": 1.0, "b": -2.0}, (-2.0, None)),
     "noise": 0.05,
     "drift": 0.5,
 }

@@ -168,11 +168,11 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
         ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
         (
             {"plant": ([[0.5]], [[1.0, 1.0]])},
-            "plant: got 2 inputs and 1 outputs, expected the controller's 1 inputs and 1 outputs",
+            "plant: got 2 inputs, 1 outputs, 0 known signals, expected the controller's 1 input",
         ),
         (
             {"plant": qm.LinearMPC(LAG, 3, Q=1.0, E=[[1.0]]).design.plant},
-            "plant: got 1 known signals, expected none, or 0",
+            "plant: got 1 inputs, 1 outputs, 1 known signals, expected the controller's 1 input",
         ),
     ],
 )

@@ -42,19 +42,18 @@ class Controller:
     Args:
         mpc: the MPC. Call `reset` when its plan's theta has changed.
         noise: standard deviations of the outputs' noise, as a number, a vector or by name; by
-            default the identification's. Without one, a tenth of half the distance between the
-            output's bounds or, without bounds, of ``1 / sqrt(Q)``.
+            default the identification's, else a tenth of half the distance between the output's
+            bounds or, without bounds, of ``1 / sqrt(Q)``.
         drift: standard deviations of each disturbance's change in a step; by default it moves an
-            output by its identified noise within the horizon. Without one, as ``noise``. A larger
-            ratio of drift to noise rejects disturbances faster and passes on more noise.
+            output by its identified noise within the horizon, else as ``noise``. A larger ratio of
+            drift to noise rejects disturbances faster and passes on more noise.
         gain: L ``(n + n_w, n_y)`` of an observer of your own, see `Observer`, or a function of F
             and H that returns it. Another model, noise or drift brings the Kalman filter back.
 
     Attributes:
         status: the `Outcome` of the last step, SOLVED before the first.
-        p: the input of the last plan, ``(n_p,)``.
-        target: the `Target` of the last plan's last stage, None before the first; if inputs have a
-            weight and targets differ from stage to stage, those of all stages.
+        p, target: the last plan's input ``(n_p,)`` and `Target`, None before the first: that of
+            its last stage, or of all if `Design.staged`.
 
     Raises:
         QPError: an argument is invalid, or the model has no filter.
@@ -87,17 +86,12 @@ class Controller:
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
-        """Forget the past: the plant rests with the outputs y.
+        """Forget the past: the plant rests with the outputs ``y`` and ``known`` signals.
 
         Without y, its state may be any state in the model's log; without a log it rests with the
         next step's outputs. `simulate` and `learn` also start from rest. If the plant moves, pass
-        only its last input.
-
-        Args:
-            y: outputs, by name or as a vector.
-            u: the input that holds the plant there, by default zero; it is clipped into the bounds.
-                The next move is counted from it.
-            known: known signals, as in `step`.
+        only ``u``, the input that holds it there, by default zero and clipped into the bounds; the
+        next move is counted from it. The forms are those of `step`.
 
         Raises:
             QPError: an argument is invalid.
@@ -201,13 +195,9 @@ class Controller:
     def observe(self, y: Any, u: Any, known: Any = None) -> None:
         """Record a step in manual mode, in which another input than this controller's was applied.
 
-        The estimates follow, and the next `step` moves from that input: without a bump.
-
-        Args:
-            y: outputs, as in `step`.
-            u: the input that was applied, by name or as a vector ``(m,)``. The last input replaces
-                an entry that is None, NaN or absurd.
-            known: the known signals of this step, in the forms of `step`.
+        The estimates follow, and the next `step` moves from that input ``u``: without a bump. The
+        last one replaces an entry that is None, NaN or absurd. The outputs ``y`` and one row of
+        ``known`` signals have the forms of `step`.
 
         Raises:
             QPError: a name or shape is wrong, or known signals are missing.
@@ -223,11 +213,10 @@ class Controller:
 
         So do the last input, what is not named and, without ``noise`` and ``drift``, the observer.
 
-        Args:
-            changes: some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
-                ``du_bounds``, ``y_slack``, ``u_target`` and ``violation`` of `LinearMPC`, ``noise``
-                and ``drift``. A mapping changes the signals that it names; None in it removes a
-                bound or a weight, or asks for the default of another argument.
+        ``changes`` are some of the arguments ``Q``, ``R``, ``dR``, ``y_bounds``, ``u_bounds``,
+        ``du_bounds``, ``y_slack``, ``u_target``, ``violation``, ``constraints`` and
+        ``terminal_constraints`` of `LinearMPC`, ``noise`` and ``drift``. A mapping changes what it
+        names; None in it removes it, or asks for the default.
 
         Raises:
             QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
@@ -273,8 +262,7 @@ class Controller:
         """Return a closed loop of a copy of this controller with a plant, from rest.
 
         A model starts as near as it can to rest with the last `reset`'s input and outputs and the
-        first known signals. An environment starts where its own reset says, and the estimates start
-        from any state of the model's log or, without one, from rest with that input.
+        first known signals; an environment where its own reset says, with estimates as without y.
 
         Args:
             plant: a model as `LinearMPC` takes it, by default its own; or an environment with
@@ -304,10 +292,10 @@ class Controller:
         environment, where its own reset says.
 
         Args:
-            source: an environment, as in `simulate`: the controller gathers transitions in closed
-                loops whose set-points move, within its bounds, and pairs of further loops decide.
-                Or a log of its signals, as `read_log` reads it: its first two thirds are fitted,
-                and loops with a model of the last third, with its one-step errors as noise, decide.
+            source: an environment, as in `simulate`, for transitions in closed loops whose
+                set-points move within the bounds, and further pairs of loops that decide. Or a log
+                of its signals, as `read_log` reads it: its first two thirds are fitted, and loops
+                with a model of the last third, with its one-step errors as noise, decide.
             transitions: the number to gather from an environment, rounded up to whole loops.
             options: ``r``, the middle of the set-points, by default the last one, or the log's mean
                 within the outputs' bounds. ``spread``: their largest distance from it, by default a
@@ -334,9 +322,8 @@ class Controller:
 
         It is `torch_qpmpc.improve` for this controller: its observer, target and bounds act in
         loops of a model that is identified from the log, with its noise. `Run.costs` is the cost.
-        If held-out loops cost less, and `review` has no new fault, the new theta is kept;
-        estimates and last input stay. Half of the loops have constant set-points. q and b are held
-        where they are learned, as the outputs would settle beside r.
+        If held-out loops cost less, and `review` has no new fault, the new theta is kept; estimates
+        and last input stay. Half of the loops have constant set-points. Learned q and b are held.
 
         Args:
             log: a log of its signals, as `read_log` reads it. Loops start at its steps within the
@@ -361,12 +348,9 @@ class Controller:
         """Return findings about this design: sentences, and a remedy for each fault.
 
         They cover the cost, the terminal weight, the horizon, the disturbances, hard bounds, the
-        reach of set-points, and the loop without active bounds (its margin, offset and noise).
-
-        Args:
-            r: set-points that the inputs must reach, by default the last step's.
-            known: a row of known signals that are held, by default the last step's or reset's, else
-                the means of the model's log, else zero. The finding about set-points shows them.
+        reach of set-points ``r``, by default the last step's, and the loop without active bounds
+        (its margin, offset and noise). ``known``, a row, is held, by default the last step's or
+        reset's, else the means of the model's log, else zero.
 
         Raises:
             QPError: r or known is invalid.
@@ -388,22 +372,17 @@ class Controller:
     def export_c(
         self, folder: str | Path, *, name: str = "policy", **options: Any
     ) -> ControllerExport:
-        """Write this controller as C99 without heap or dependencies.
+        """Write this controller as C99 without heap or dependencies to ``folder``.
 
         ``name_step(&state, y, r, known, u)`` of ``name.c`` is `step`, with the estimates, the last
         input and the active sets of all QPs in the state. With a C compiler, a closed loop is
         compared with this controller's.
 
-        Args:
-            folder: the folder of the files, created if it does not exist.
-            name: the beginning of the names in C.
-            options: ``dtype``, ``max_iterations`` and ``storage`` of `export_c`. ``missing``: True
-                for a plant whose outputs are often missing: the C code then carries the covariance
-                of the n_e estimates, as `step` does: n_e^2 more numbers of state, tables of twice
-                as many, about 4 n_e^3 operations. Otherwise the steady gains stay.
-
-        Returns:
-            Sizes and the measured agreement.
+        The ``options`` are ``dtype``, ``max_iterations`` and ``storage`` of `export_c`, and
+        ``missing``, True for a plant whose outputs are often missing: the C code then carries the
+        covariance of the n_e estimates, as `step` does, with n_e^2 more numbers of state, tables of
+        twice as many, and about 4 n_e^3 operations. Otherwise the steady gains stay. The report has
+        sizes and the measured agreement.
 
         Raises:
             QPError: as in `export_c`, or the self-test fails.

@@ -22,7 +22,8 @@ from torch_qpmpc.mpc.validation import as_tensor, check_weight
 #: A response above this share of those soon after decides whether an output keeps its bound.
 DECIDES = 0.25
 Sides = tuple[Array, Array]
-REFERENCES = ("held", "preview")
+#: The weights of signals by name, (lower, upper), and the price of a violation, NaN by default.
+Constraint = tuple[dict[str, float], tuple[float, float], float]
 #: The default price of a violation by an output's size, relative to a typical stage's cost.
 Y_SLACK = 1e3
 
@@ -40,11 +41,43 @@ class Target(NamedTuple):
     r: Any
 
 
+class Bands(NamedTuple):
+    """Rows ``lower <= W [y; u] + D du - K (d - nominal) <= upper``, at a ``price`` of violations.
+
+    They have the names of their ``arguments`` of `LinearMPC` and of their signals or constraints.
+    """
+
+    arguments: Array
+    names: Array
+    W: Array
+    D: Array
+    K: Array
+    lower: Array
+    upper: Array
+    price: Array
+
+    def take(self, places: Array) -> Bands:
+        """Return some of the rows."""
+        return Bands(*(part[places] for part in self))
+
+    def beside(self, other: Bands) -> Bands:
+        """Return these rows and others."""
+        return Bands(*map(np.concatenate, zip(self, other, strict=True)))
+
+    def at(self, d: Array) -> Sides:
+        """Return the bounds of ``W [y; u]`` for known signals ``(*batch, n_d)``, less nominal."""
+        return self.lower + d @ self.K.T, self.upper + d @ self.K.T
+
+    def sizes(self, y: Array, u: Array) -> Array:
+        """Return the sizes of the rows for those of the outputs and inputs."""
+        return np.abs(self.W) @ np.append(y, u) + np.abs(self.D) @ u
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """The arguments of `LinearMPC`, read and checked, as arrays.
 
-    Weights are ``(n_y, n_y)`` and ``(m, m)``, NaN in ``y_slack`` ``(n_y,)`` becomes `price`, and
+    Weights are ``(n_y, n_y)`` and ``(m, m)``, NaN in ``y_slack`` ``(n_y,)`` becomes `prices`', and
     ``u_bounds`` are within the ``levels`` of inputs, with the other arguments of `Bounds` for these
     in ``switching``. Known signals that bound an output or input from below and above are in
     ``limits`` by its name, "" on a side without one.
@@ -72,9 +105,11 @@ class Design:
     switching: dict[str, Any] = field(default_factory=dict)
     u_target: dict[str, float] = field(default_factory=dict)
     violation: dict[str, float] = field(default_factory=dict)
+    constraints: dict[str, Constraint] = field(default_factory=dict)
+    terminal_constraints: dict[str, Constraint] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_choice("references", self.references, REFERENCES)
+        check_choice("references", self.references, ("held", "preview"))
         check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
         if not (self.Q.any() or self.linear):
             y, u = self.plant.outputs[0], self.plant.inputs[0]
@@ -83,7 +118,8 @@ class Design:
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
         bounds = within_levels(self.u_bounds, self.levels, self.plant, self.du_bounds)
         object.__setattr__(self, "u_bounds", bounds)
-        prices = np.where(np.isnan(self.y_slack), self.price, self.y_slack)
+        default = self.prices(np.eye(len(self.Q), len(self.Q) + len(self.R)))
+        prices = np.where(np.isnan(self.y_slack), default, self.y_slack)
         object.__setattr__(self, "y_slack", prices)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
@@ -108,11 +144,10 @@ class Design:
 
         Weights of two signals stay with both; None removes a bound or all weights of a signal.
         """
+        if isinstance(old := getattr(self, name), dict):
+            return {**old, **changes}
         if unknown := sorted({*changes} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
-        old = getattr(self, name)
-        if name in ("u_target", "violation"):
-            return {**old, **changes}
         if name == "y_slack":
             return {**dict(zip(names, old.tolist(), strict=True)), **changes}
         if name.endswith("_bounds"):
@@ -144,10 +179,10 @@ class Design:
         spent = sum(price * u[names.index(name)] for name, price in prices.items())
         return float(y @ self.Q @ y + u @ (self.R + self.dR) @ u + spent)
 
-    @property
-    def price(self) -> Array:
-        """The default of y_slack, ``(n_y,)``: a usual deviation costs `Y_SLACK` typical stages."""
-        return Y_SLACK * (self.typical or 1.0) / self.usual
+    def prices(self, W: Array) -> Array:
+        """Return the default price of violations of ``W [y; u]``: `Y_SLACK` typical stages."""
+        usual = np.abs(W) @ np.append(self.usual, self.scaling.u)
+        return Y_SLACK * (self.typical or 1.0) / usual
 
     @property
     def usual(self) -> Array:
@@ -192,6 +227,8 @@ class Design:
             levels={},
             u_target={},
             violation={},
+            constraints={},
+            terminal_constraints={},
             Q=self.Q * np.outer(y, y),
             R=self.R * np.outer(u, u),
             dR=self.dR * np.outer(u, u),
@@ -226,13 +263,56 @@ class Design:
         return moved > TIE * self.scaling.u
 
     @cached_property
-    def bounded(self) -> tuple[Array, Array]:
-        """The places of the outputs and of the inputs with bounds."""
-        y, u = (
-            np.isfinite(bounds).any(0) | (of >= 0).any(0)
-            for bounds, of in zip((self.y_bounds, self.u_bounds), self.limited, strict=True)
+    def bands(self) -> Bands:
+        """The bounds of outputs with a price, of inputs and of moves, and the constraints."""
+        (_, m, n_y, n_d), inputs = self.plant.sizes, self.plant.inputs
+        names = *self.plant.outputs, *inputs, *(f"move of {name}" for name in inputs)
+        sides = np.hstack((self.y_bounds, self.u_bounds, self.du_bounds))
+        of = np.pad(np.hstack(self.limited), ((0, 0), (0, m)), constant_values=-1)
+        fixed, (side, i) = np.flatnonzero(np.isfinite(sides).any(0)), np.nonzero(of >= 0)
+        j, places = of[side, i], np.append(fixed, i)
+        lower, upper = (
+            np.append(part[fixed], np.where(side == k, self.nominal[j], limit))
+            for k, (part, limit) in enumerate(zip(sides, (-np.inf, np.inf), strict=True))
         )
-        return np.flatnonzero(y & (self.y_slack > 0)), np.flatnonzero(u)
+        low, high = np.pad(self.margins, ((0, 0), (0, 2 * m)))[:, places]
+        price = np.append(self.y_slack, np.full(2 * m, np.inf))[places]
+        kinds, unit = np.repeat([0, 1, 2], (n_y, m, m))[places], np.eye(len(names))[places]
+        K = np.pad(np.eye(n_d)[j], ((len(fixed), 0), (0, 0)))
+        parts = np.array(["y_bounds", "u_bounds", "du_bounds"])[kinds], np.array(names)[places]
+        parts = *parts, unit[:, : n_y + m], unit[:, n_y + m :], K, lower + low, upper - high, price
+        order = np.argsort(kinds, kind="stable")
+        rows = Bands(*parts).take(order[price[order] > 0])
+        return rows.beside(self.combined("constraints"))
+
+    @cached_property
+    def ends(self) -> Bands:
+        """The rows of the last stage: `bands` of outputs alone, and the terminal constraints."""
+        return self.bands.take(self.inner).beside(self.combined("terminal_constraints"))
+
+    @cached_property
+    def inner(self) -> Array:
+        """Mask of the `bands` of outputs alone."""
+        return self.bands.W[:, : len(self.Q)].any(1) & ~self.bands.W[:, len(self.Q) :].any(1)
+
+    def combined(self, argument: str) -> Bands:
+        """Return the rows of combinations of signals; without outputs they are hard by default."""
+        own, names = getattr(self, argument), (*self.plant.outputs, *self.plant.inputs)
+        W = [[weights.get(x, 0.0) for x in names] for weights, *_ in own.values()]
+        W, bounds = np.reshape(W, (-1, len(names))), [pair for _, pair, _ in own.values()]
+        price = np.array([price for *_, price in own.values()])
+        default = np.where(W[:, : len(self.Q)].any(1), self.prices(W), np.inf)
+        price = np.where(np.isnan(price), default, price)
+        parts = np.full(len(own), argument), np.array([*own], str), W
+        none = (np.zeros((len(own), len(x))) for x in (self.plant.inputs, self.plant.known))
+        return Bands(*parts, *none, *np.reshape(bounds, (-1, 2)).T, price)
+
+    @cached_property
+    def bounded(self) -> tuple[Array, Array]:
+        """The places of the outputs and of the inputs that bounds and constraints have."""
+        acting = np.vstack((self.bands.W, self.ends.W)).any(0)
+        y, u = np.split(acting, [len(self.Q)])
+        return np.flatnonzero(y), np.flatnonzero(u)
 
     @cached_property
     def limited(self) -> tuple[Array, Array]:
@@ -289,7 +369,8 @@ class Design:
         margins, errors = np.zeros((2, len(self.Q))), self.plant.errors
         for name, share in self.violation.items():
             i, got = self.plant.outputs.index(name), f"{share:g} of {name}"
-            if not 0 < share < 1 or i not in self.bounded[0]:
+            bounded = np.isfinite(self.y_bounds).any(0) | (self.limited[0] >= 0).any(0)
+            if not 0 < share < 1 or not (bounded & (self.y_slack > 0))[i]:
                 raise QPError.expected("violation", got, "a share in (0, 1), of a bounded output")
             k = int(self.answers(DECIDES)[i])
             e = np.zeros(0) if errors is None else np.sort(errors[:, k - 1 : k, i], axis=None)
@@ -325,8 +406,12 @@ class Design:
             level = known[..., self.plant.known.index(price)] if signal else price
             cost = cost + level * u[..., self.plant.inputs.index(name)]
         lower, upper = map(torch.as_tensor, self.bounds_at(known.numpy())[0])
-        outside = (lower - y).relu() + (y - upper).relu()
-        prices = torch.where(outside > 0, torch.as_tensor(self.y_slack), 0.0)  # inf times 0 is none
+        own = self.combined("constraints")
+        x = torch.cat((y, u), -1) @ torch.from_numpy(own.W.T)
+        above = torch.cat((y - upper, x - torch.from_numpy(own.upper)), -1)
+        below = torch.cat((lower - y, torch.from_numpy(own.lower) - x), -1)
+        outside, prices = above.relu() + below.relu(), np.append(self.y_slack, own.price)
+        prices = torch.where(outside > 0, torch.from_numpy(prices), 0.0)  # inf times 0 is none
         return cost + (prices * outside).sum(-1)
 
     def arranged(self, arrays: Any, x: Any, target: Target, u_last: Any, known: Any) -> Any:
@@ -396,10 +481,11 @@ class Design:
     def pulls(self) -> tuple[Array, Array]:
         """The maps of y_s - r and of the last multipliers of the target to `weighed`'s pull."""
         Y = self.steady.Y
-        rows, *_, of = self.rows(0, Y, np.zeros((len(self.plant.known), Y.shape[1])))
+        W, n_y = self.bands.W, len(Y)
+        held = self.inner & (W @ np.vstack((Y, self.steady.U))).any(1)
         Y = Y[:, : self.steady.n_a]
         moved = Y @ np.linalg.pinv(Y.T @ self.Q @ Y) @ Y.T
-        return moved @ self.Q, moved[:, of[rows.any(-1)]] / 2
+        return moved @ self.Q, moved @ W[held, :n_y].T / 2
 
     def weighed(self, arrays: Any, r: Any, y_s: Any, lam: Any) -> Any:
         """Return the set-points that the plan weighs: r, but for what bounds of outputs hold off.
@@ -420,23 +506,6 @@ class Design:
         """True if a plan has targets that differ from stage to stage, for r or a weight of u."""
         varies = self.acts.any() or self.limits
         return self.references == "preview" or bool(self.R.any() and varies)
-
-    def rows(self, kind: int, S: Array, K: Array) -> tuple[Array, Array, Array, Array]:
-        """Return rows D with lower and upper bounds, and the place of the signal of each.
-
-        The maps S to the outputs (of ``kind`` 0) or inputs (1) and K to known signals make them.
-        """
-        bounds, of = (self.y_bounds, self.u_bounds)[kind], self.limited[kind]
-        fixed, (side, i) = np.flatnonzero(np.isfinite(bounds).any(0)), np.nonzero(of >= 0)
-        j = of[side, i]
-        lower, upper = (
-            np.append(part[fixed], np.where(side == k, self.nominal[j], limit))
-            for k, (part, limit) in enumerate(zip(bounds, (-np.inf, np.inf), strict=True))
-        )
-        places = np.append(fixed, i)
-        if kind == 0:
-            lower, upper = lower + self.margins[0, places], upper - self.margins[1, places]
-        return np.vstack((S[fixed], S[i] - K[j])), lower, upper, places
 
     @cached_property
     def places(self) -> dict[str, slice]:
@@ -550,6 +619,31 @@ def read_limits(
             numbers[key] = [None if isinstance(x, str) else x for x in pair]
             limits[key] = tuple(x if isinstance(x, str) else "" for x in pair)
     return numbers, limits
+
+
+def read_constraints(name: str, value: Any, names: Sequence[str]) -> dict[str, Constraint]:
+    """Read combinations of the signals ``names``, with bounds and prices, by a name of their own.
+
+    Raises:
+        QPError: one is no such tuple, or has an unknown signal.
+    """
+    want = "(weights of signals by name, (lower, upper)), or these with the price of a violation"
+    if not isinstance(value, Mapping | None):
+        raise QPError.expected(name, repr(value), f"a mapping from names to {want}")
+    read: dict[str, Constraint] = {}
+    for key, own in (value or {}).items():
+        if own is None:
+            continue
+        given = isinstance(own, Sequence) and len(own) in (2, 3) and isinstance(own[0], Mapping)
+        weights = read_vector(name, own[0] if given else {}, names, 0.0)
+        price = [np.nan, *own[2:]][-1] if given else np.nan
+        priced = isinstance(price, int | float) and not price < 0
+        if not (np.isfinite(weights).all() and weights.any() and priced):
+            raise QPError.expected(name, f"{key!r}: {own!r}", want, "Prices are >= 0, or inf.")
+        (lower,), (upper,) = read_bounds(name, {key: own[1]}, [key])
+        pairs = zip(names, weights.tolist(), strict=True)
+        read[key] = {x: c for x, c in pairs if c}, (float(lower), float(upper)), float(price)
+    return read
 
 
 def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:

@@ -189,11 +189,9 @@ class Steady:
     """The steady states of a plant, as linear maps of [w; d; 1].
 
     Attributes:
-        X, U, Y: the maps of v to x_s, u_s and y_s: ``(n, n_v)``, ``(m, n_v)``, ``(n_y, n_v)``. v
-            has no unit; the outputs that f moves have entries in the last columns of Y.
+        X, U, Y: the maps of v, without a unit, to x_s, u_s and y_s, with n_v columns.
         x, u, y: the maps of [w; d; 1] to them, with n_w + n_d + 1 columns.
-        W: the weight of f, ``(n_f, n_f)``: that of the inputs, in place of zero their squares
-            relative to their sizes.
+        W: the weight of f, ``(n_f, n_f)``: the inputs', in place of zero that of their sizes.
     """
 
     X: Array

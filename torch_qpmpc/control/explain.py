@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -111,36 +111,31 @@ def explain(
 
 def _limits(design: Design, lam: Array, y: Array, u: Array, known: Array) -> tuple[Limit, ...]:
     """Return the bounds with multipliers ``lam`` of G's rows, dearest first."""
-    plant, N, none = design.plant, len(u), np.empty((len(design.plant.known), 0))
-    of_y, of_u = (design.rows(i, np.empty((x.shape[1], 0)), none)[-1] for i, x in enumerate((y, u)))
-    of_y = of_y[design.y_slack[of_y] > 0]
-    of_du = np.flatnonzero(np.isfinite(design.du_bounds).any(0))
-    n_y, width = len(of_y), len(of_y) + len(of_u) + len(of_du)
-    prices = np.append(lam[len(lam) - N * width - n_y :], np.zeros(width - n_y))
-    prices = prices.reshape(N + 1, width)  # the last stage has rows of outputs alone
-    prices[0, :n_y] = 0.0  # nothing moves the outputs of this step
-    bands, bounds = design.bounds_at(known[: N + 1], True)
-    u, of_input = np.vstack((u, u[-1:])), design.scaling.u
-    kinds = (
-        ("", plant.outputs, y, bands, design.usual, of_y),
-        ("", plant.inputs, u, bounds, of_input, of_u),
-        ("move of ", plant.inputs, np.full_like(u, np.nan), design.du_bounds, of_input, of_du),
-    )
-    rows: list[tuple[Any, ...]] = [(*kind, i) for *kind, places in kinds for i in places]
+    plant, N, bands, ends = design.plant, len(u), design.bands, design.ends
+    inner, n = np.flatnonzero(design.inner), len(bands.W)
+    of_stages, of_end = np.split(lam[len(lam) - N * n - len(ends.W) :], [N * n])
+    bands = bands.beside(ends.take(np.s_[len(inner) :]))
+    prices = np.zeros((N + 1, len(bands.W)))
+    prices[:N, :n] = of_stages.reshape(N, n)
+    prices[0, inner] = 0.0  # nothing moves the outputs of this step
+    prices[N, [*inner, *range(n, len(bands.W))]] = of_end
+    values = np.hstack((y, np.vstack((u, u[-1:])))) @ bands.W.T  # of moves zero, as if within
+    sides = bands.at(known[: N + 1] - design.nominal)
+    sizes = bands.sizes(design.usual, design.scaling.u)
+    rows = zip(bands.names, sizes, prices.T, values.T, *(side.T for side in sides), strict=True)
     limits = []
-    for (word, names, x, sides, size, i), price in zip(rows, prices.T, strict=True):
+    for name, size, price, x, *sides in rows:
         for side, sign, bound in zip(("lower", "upper"), (-1, 1), sides, strict=True):
-            steps = np.flatnonzero(sign * price * size[i] > ACTIVE * design.typical)
+            steps = np.flatnonzero(sign * price * size > ACTIVE * design.typical)
             if not len(steps):
                 continue
-            bound = np.broadcast_to(bound, x.shape)[steps, i]
-            over = float(np.nan_to_num((sign * (x[steps, i] - bound)).max()))
-            over, saved = over * bool(over > ACTIVE * size[i]), abs(price[steps]).sum()
-            unit = plant.units.get(names[i], "")
-            text = f"{word}{names[i]} is at its {side} bound {bound[0]:.4g} {unit}".rstrip()
+            over = float(np.nan_to_num(sign * (x - bound)[steps], nan=-np.inf).max())
+            over, saved = over * bool(over > ACTIVE * size), abs(price[steps]).sum()
+            unit = plant.units.get(name.removeprefix("move of "), "")
+            text = f"{name} is at its {side} bound {bound[steps[0]]:.4g} {unit}".rstrip()
             text += f" in steps {steps[0]} to {steps[-1]}"
             text += f", violated by up to {over:.3g}" * bool(over)
             more = f"{unit or 'unit'} {'more' if sign > 0 else 'less'}"
             text += f": one {more} would save {saved:.3g} of the cost."
-            limits.append(Limit(word + names[i], text, float(saved), over))
+            limits.append(Limit(str(name), text, float(saved), over))
     return tuple(sorted(limits, key=lambda limit: -limit.price))

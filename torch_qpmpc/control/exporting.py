@@ -39,16 +39,11 @@ unsigned long policy_state_size(void) { return sizeof(policy_state); }
 
 @dataclass(frozen=True)
 class ControllerExport:
-    """Report of `Controller.export_c`.
+    """Report of `Controller.export_c`: its ``files``, and the reports of ``plan`` and ``target``.
 
-    Attributes:
-        files: the paths of all files.
-        plan, target: the reports of the QPs.
-        table_bytes, state_bytes: the sizes of all constant tables, without self-tests, and of the
-            state, None without a compiler.
-        steps, difference: the length of the closed loop that is compared, and the largest
-            difference of an input; None without a compiler.
-        missing: the covariance of the estimates is carried where outputs are missing.
+    ``table_bytes`` are all constant tables without self-tests; ``state_bytes`` and the largest
+    ``difference`` of an input in a closed loop of ``steps`` are None without a compiler. With
+    ``missing`` the covariance of the estimates is carried where outputs are missing.
     """
 
     files: tuple[Path, ...]
@@ -356,16 +351,11 @@ def _pulls(mpc: LinearMPC) -> dict[str, Array]:
 
 def _moves(mpc: LinearMPC, dtype: str) -> Array:
     """Return the plan's bounds of the first move, ``(2, m)``, with room for rounding."""
-    design = mpc.design
-    m, last = design.plant.sizes[1], design.places["u_last"].start - design.places["known"].stop
-    bounds = np.outer([-np.inf, np.inf], np.ones(m))
-    qp, n_p, n_x = mpc.plan.quadratic_program(), mpc.plan.n_p, mpc.plan.n_x
-    G, *sides = (x.detach().double().cpu().numpy() for x in (qp.G, qp.lb, qp.ub))
-    for i in range(m if design.moves else 0):
-        row = np.zeros(G.shape[1])
-        row[[n_p - n_x + last + i, n_p + i]] = -1, 1
-        for k in np.flatnonzero((row == G).all(1)):
-            bounds[:, i] = [side[k] for side in sides]
+    design, bands, qp = mpc.design, mpc.design.bands, mpc.plan.quadratic_program()
+    bounds, own = np.outer([-np.inf, np.inf], np.ones(len(design.R))), bands.D.any(1)
+    first = len(qp.lb) - len(design.ends.W) - mpc.horizon * len(own)
+    sides = (side[first:][: len(own)].detach().double().cpu().numpy() for side in (qp.lb, qp.ub))
+    bounds[:, np.nonzero(bands.D)[1]] = [side[own] for side in sides]
     size = largest(bounds)
     size = np.where(size > 0, size, design.scaling.u)
     room = NEAR[dtype] * size + 4 * np.finfo(dtype).eps * largest(design.u_bounds)

@@ -38,8 +38,7 @@ class Memory(NamedTuple):
     """What a controller keeps between two steps.
 
     Attributes:
-        u: the last input, ``(m,)``.
-        e: the prediction of x and w for the next step, None before the first.
+        u, e: the last input ``(m,)``, and the next step's prediction of x and w, None at first.
         steps: the place of the next gain among `Observer.gains`, the last one from rest.
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
@@ -73,10 +72,9 @@ class Signals(NamedTuple):
 
 
 class Outcome(IntEnum):
-    """What a step has come to, which `explanation` says in words.
+    """What a step has come to; functions in C return the same numbers.
 
-    Functions in C return the same numbers. A valid signal is finite and not above
-    `Law.max_plausible`. An input that stays is clipped into its bounds.
+    No valid signal is above `Law.max_plausible`. An input that stays is clipped into its bounds.
     """
 
     SOLVED = 0
@@ -119,10 +117,9 @@ class Move(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A linear MPC with an observer; see `torch_qpmpc.control.controller.Controller`.
+    """A linear MPC with an observer, see `Controller`, and ``noise``, ``drift`` as its arrays.
 
-    ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard deviations, and ``max_plausible`` the
-    largest sizes of outputs and set-points, and of known signals.
+    ``max_plausible`` are the largest sizes of outputs and set-points, and of known signals.
     """
 
     mpc: LinearMPC

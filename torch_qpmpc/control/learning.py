@@ -65,13 +65,10 @@ class Plant(NamedTuple):
 class LearningReport:
     """The outcome of `Controller.learn`; ``print`` shows it.
 
-    Attributes:
-        accepted: True if the controller has changed.
-        before, after: the mean costs of the compared closed loops, with the old and the new model.
-        pairs, steps, plant: their number, their length, and their plant in words.
-        interval: the 95 % confidence interval of the mean difference of their costs, plus the
-            hundredth of the old one that is the least gain.
-        transitions, model: the new model, and the number of transitions that it is fitted to.
+    The controller has changed if it is ``accepted``. ``before`` and ``after`` are the mean costs of
+    ``pairs`` of closed loops of ``steps`` with the ``plant``, with the old and the new ``model`` of
+    so many ``transitions``; the 95 % ``interval`` is that of the mean difference of their costs,
+    plus the hundredth of the old one that is the least gain.
     """
 
     accepted: bool

@@ -27,11 +27,9 @@ FREQUENCIES, SLOWEST = 400, 1e-4
 class LinearLoop:
     """The loop's matrices.
 
-    Attributes:
-        A, B: ``(n + n_e + m, n + n_e + m)``, and the factors of [load; bias; r].
-        controller: A_c, B_c, C_c and D_c from y to u, with the state [e; u_last].
-        plant: A, B and C of the model.
-        units: the sizes of the inputs, ``(m,)``.
+    A and B are the factors of the state and of [load; bias; r]; ``controller`` has A_c, B_c, C_c
+    and D_c from y to u with the state [e; u_last], ``plant`` A, B and C of the model, and ``units``
+    the sizes of the inputs.
     """
 
     A: Array

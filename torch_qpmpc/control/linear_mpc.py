@@ -17,6 +17,7 @@ from torch_qpmpc.control.design import (
     Design,
     Target,
     read_bounds,
+    read_constraints,
     read_limits,
     read_moves,
     read_prices,
@@ -57,11 +58,11 @@ class LinearMPC:
 
     All signals are deviations from the last target, which keeps the values near it exact. p has
     d_0, .., d_N, the known signals, less the last ones if they act on the plant; then the state
-    [x - x_s; u_last - u_s; y_s - r; y_s; u_s; 1]. u_last is in it if moves cost or are bounded,
-    y_s - r has the outputs with a weight, and y_s and u_s have the entries with bounds. The last
-    entry adds a small constant to the values, which their errors are relative to. A preview of
-    references has r - y_s in d_k instead, and if inputs have a weight d_k has the u_s of its stage.
-    `target` and `arrange` make p, and the `plan`'s policy is u - u_s; `Controller` does all of it.
+    [x - x_s; u_last - u_s; y_s - r; y_s; u_s; 1]: u_last if moves cost or are bounded, y_s - r of
+    outputs with a weight, y_s and u_s of bounds and constraints, and an entry that adds a small
+    constant to the values, which their errors are relative to. A preview of references has r - y_s
+    in d_k instead, and with weights of inputs d_k has the u_s of its stage. `target` and `arrange`
+    make p, and the `plan`'s policy is u - u_s; `Controller` does all of it.
 
     Args:
         model, E, dt, inputs, outputs, known: the plant; see `read_model`.
@@ -73,6 +74,10 @@ class LinearMPC:
         y_slack: the price of a unit of violation of an output's bounds; inf makes them hard. By
             default a violation by half the distance between the bounds costs 1000 times a stage
             with all signals that far off the target.
+        constraints: bounds of combinations of outputs and inputs by a name, with the weights of
+            their signals: ``{"power": ({"heater": 1.0, "fan": 0.5}, (None, 8.0))}``. A third entry
+            is the price of a violation: by default as ``y_slack``'s, without outputs inf.
+        terminal_constraints: the same of outputs, for the last stage alone.
         linear: price times input, as a mapping from inputs to numbers or names of known signals.
         references: ``"held"``: one r for the plan. ``"preview"``: one for each stage.
         disturbances: the ones that an observer estimates, by default one for each output; see
@@ -126,6 +131,8 @@ class LinearMPC:
         y_slack: Any = None,
         u_target: Any = None,
         violation: Any = None,
+        constraints: Any = None,
+        terminal_constraints: Any = None,
         linear: Mapping[str, str | float] | None = None,
         references: str = "held",
         disturbances: Any = "auto",
@@ -149,10 +156,10 @@ class LinearMPC:
         prices += [*signals_of(y_bounds), *signals_of(u_bounds)]
         plant = read_model(model, E, dt, inputs, outputs, known, prices)
         check_whole("horizon", horizon, 1)
-        weights = {"Q": Q, "R": R, "dR": dR, "y_slack": y_slack}
-        weights |= {"u_target": u_target, "violation": violation}
+        ends = {"constraints": constraints, "terminal_constraints": terminal_constraints}
+        wished = {"y_slack": y_slack, "u_target": u_target, "violation": violation, **ends}
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
-        wishes = read_wishes(plant, None, **weights, **bounds)
+        wishes = read_wishes(plant, None, Q=Q, R=R, dR=dR, **wished, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
         levels, switching = read_switching(u_levels, plant, rules, integer_horizon, max_nodes)
         of_u = within_levels(wishes["u_bounds"], levels, plant, wishes["du_bounds"])
@@ -336,6 +343,8 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
     readers |= {"y_bounds": (read_bounds, y), "u_bounds": (read_bounds, u)}
     readers |= {"du_bounds": (read_moves, u), "y_slack": (read_wished, y)}
     readers |= {"u_target": (read_said, u), "violation": (read_said, y)}
+    readers["constraints"] = read_constraints, (*y, *u)
+    readers["terminal_constraints"] = read_constraints, y
     check_keywords("redesign", wishes, [*readers])
     limits = {} if old is None else old.limits
     for name, value in wishes.items():

@@ -2,23 +2,20 @@
 
 The plan's stages weigh y_k - r_k. Where bounds of inputs keep the target's outputs y_s off r, the
 cost of an endless loop about the target has a slope lam'(x - x_s), and so has the terminal cost,
-with lam = gamma A'lam + 2 C'Q (y_s - r). With it the plan rests at the target whatever its horizon
-(Zanon and Faulwasser, "Economic MPC without terminal constraints: gradient-correcting end penalties
-enforce asymptotic stability", J. Process Control 63, 2018). Of bounds of outputs see
-`Design.weighed`.
+with lam = gamma A'lam + 2 C'Q (y_s - r): the plan rests at the target whatever its horizon (Zanon
+and Faulwasser, "Economic MPC without terminal constraints", J. Process Control 63, 2018). Of bounds
+of outputs see `Design.weighed`.
 
 The target is the steady state within bounds that is nearest to the set-point:
 
     min over v of (y_s - r)'Q(y_s - r) + price violation(y_s),   u_s within its bounds,
 
 where (x_s, u_s, y_s) is the steady state for v, the disturbance w and known signals d (see
-`torch_qpmpc.control.disturbance`). It is the policy of a one-stage `QPMPC` whose state, and p, is
-[r; w; d; 1] and whose action is v.
-
-Where several steady states have the same outputs with a weight, v = [a; f], the state is [f_0; r;
-w; d; 1], and f - f_0 has a weight. From f_0 = 0 the QP is solved again about its own f until that
-stays (the proximal point method, Rockafellar, SIAM J. Control Optim. 14, 1976): a weight so small
-that it moves no output off r would cost numbers in C their digits.
+`torch_qpmpc.control.disturbance`): the policy of a one-stage `QPMPC` of [r; w; d; 1], whose action
+is v = [a; f], where f leaves the outputs with a weight as they are. The state then begins with f_0,
+and f - f_0 has a weight: from f_0 = 0 the QP is solved again about its own f until that stays (the
+proximal point method, Rockafellar, SIAM J. Control Optim. 14, 1976). A weight so small that it
+moves no output off r would cost numbers in C their digits.
 """
 
 from __future__ import annotations
@@ -186,31 +183,26 @@ def _bounds(design: Design) -> Bounds:
 
     The latter hold in all stages of a block but for those with known signals.
     """
-    s, size = design.selectors(), design.places["u"].start
-    moving = np.isfinite(design.du_bounds).any(0)
-    of_y, of_u = design.bounded
-    y, u = design.plant.C @ s["x"], s["u"].copy()
-    y[of_y] += s["y_s"]
-    u[of_u] += s["u_s"]
-    *soft, places = design.rows(0, y, s["known"])
-    priced = design.y_slack[places] > 0
-    soft = [part[priced] for part in soft]
-    *hard, _ = design.rows(1, u, s["known"])
-    du = s["u"][moving] - s["u_last"][moving] if moving.any() else u[:0]
-    limits = du, *(side[moving] for side in design.du_bounds)
-    D, lower, upper = map(np.concatenate, zip(soft, hard, limits, strict=True))
-    n_y, price = len(soft[0]), design.y_slack[places][priced]
-    rows = n_y - 1 + np.cumsum(np.isfinite(design.u_bounds).any(0))
-    of_u = [design.levels.get(name) for name in design.plant.inputs]
-    levels = {"action_levels": of_u, "level_rows": rows.tolist()} if design.levels else {}
+    s, n_y, size = design.selectors(), len(design.Q), design.places["u"].start
+    bands, ends, (of_y, of_u) = design.bands, design.ends, design.bounded
+    signals = np.vstack((design.plant.C @ s["x"], s["u"]))
+    signals[of_y] += s["y_s"]
+    signals[n_y + of_u] += s["u_s"]
+    D = bands.W @ signals - bands.K @ s["known"]
+    if design.moves:
+        D += bands.D @ (s["u"] - s["u_last"])
+    last = (ends.W @ signals - ends.K @ s["known"])[:, :size]
+    first, of_u = (bands.arguments == "y_bounds").sum(), np.isfinite(design.u_bounds).any(0)
+    levels = [design.levels.get(name) for name in design.plant.inputs]
+    levels = {"action_levels": levels, "level_rows": (first - 1 + np.cumsum(of_u)).tolist()}
     held = D[:, size:].any(-1) & ~D[:, : design.places["known"].stop].any(-1)
     return Bounds(
-        constraints=(D, lower, upper) if len(D) else None,
-        terminal_constraints=(soft[0][:, :size], *soft[1:]) if n_y else None,
-        constraint_slack=np.concatenate((price, np.full(len(D) - n_y, np.inf), price)),
+        constraints=(D, bands.lower, bands.upper) if len(D) else None,
+        terminal_constraints=(last, ends.lower, ends.upper) if len(last) else None,
+        constraint_slack=np.append(bands.price, ends.price),
         discount_slack=True,
         held=held if len(D) else None,
-        **levels,
+        **(levels if design.levels else {}),
         **design.switching,
     )
 
@@ -259,34 +251,26 @@ def target_mpc(design: Design) -> QPMPC:
         f = np.eye(len(steady.W), len(weight), n_x + steady.n_a)
         f[:, :n_f] -= np.eye(len(f), n_f)
         weight += _squares(f, _preference(design) * steady.W)
-    u, n_d = design.scaling.u, design.plant.sizes[3]
-    K = np.eye(n_d, error.shape[1], n_x - 1 - n_d)
-    D, lower, upper, of = design.rows(1, inputs, K)
-    moved = D[:, n_x:].any(-1)
-    D, lower, upper = ((part.T / u[of]).T[moved] for part in (D, lower, upper))
+    sizes, n_d = design.scaling, design.plant.sizes[3]
     error[:, :n_r] = 0.0
-    *soft, of = design.rows(0, error, K)
-    moved = soft[0][:, n_x:].any(-1)
-    price = np.full(len(D), np.inf)
-    if np.linalg.matrix_rank(steady.U / u[:, None], RANK) < len(u):
+    K, bands = np.eye(n_d, error.shape[1], n_x - 1 - n_d), design.bands
+    D, of_y = bands.W @ np.vstack((error, inputs)) - bands.K @ K, bands.W[:, :n_y].any(1)
+    moved = D[:, n_x:].any(-1)
+    order = np.argsort(design.inner, kind="stable")
+    order = order[moved[order]]
+    units = np.where(of_y, 1.0, bands.sizes(sizes.y, sizes.u))
+    price = bands.price * units
+    price[of_y] = np.minimum(price[of_y], HARD * design.prices(bands.W[of_y]))
+    if np.linalg.matrix_rank(steady.U / sizes.u[:, None], RANK) < len(sizes.u):
         # The plant integrates, and a load may have no steady inputs within bounds.
-        price[:] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
-    slack = np.append(price, np.minimum(design.y_slack, HARD * design.price)[of[moved]])
-    rows = zip((D, lower, upper), soft, strict=True)
-    rows = tuple(np.concatenate((of_u, of_y[moved])) for of_u, of_y in rows)
-    return _of_one_stage(n_x, weight, SCALE * design.typical, rows, slack)
-
-
-def _of_one_stage(
-    n_x: int, weight: Any, constant: float, rows: tuple[Array, ...], slack: Array
-) -> QPMPC:
-    """Return the QPMPC with the rows (D, lower, upper), whose state has no cost at its end."""
-    n_v = len(weight) - n_x
-    weight[n_x - 1, n_x - 1] += 2 * constant
+        price[np.isinf(price)] = NEARLY_HARD * np.linalg.norm(weight[n_x:, n_x:], 2)
+    rows = ((part.T / units).T[order] for part in (D, bands.lower, bands.upper))
+    weight[n_x - 1, n_x - 1] += 2 * SCALE * design.typical
     cost = Cost(weight, np.zeros((n_x, n_x)), hessian="block")
-    model = Model(np.eye(n_x), np.zeros((n_x, n_v)))
-    bounds = Bounds(constraints=rows, constraint_slack=slack) if len(rows[0]) else Bounds()
-    layout, one = Layout(n_x, n_v, horizon=1), {n_x - 1: 1.0}
+    model = Model(np.eye(n_x), np.zeros((n_x, len(weight) - n_x)))
+    constraints = {"constraints": (*rows,), "constraint_slack": price[order]}
+    bounds = Bounds(**constraints) if len(order) else Bounds()
+    layout, one = Layout(n_x, len(weight) - n_x, horizon=1), {n_x - 1: 1.0}
     scheme = Scheme(layout, model, cost, bounds, gamma=1.0, constants=one)
     return QPMPC(scheme, learn=(), solver="daqp")
 

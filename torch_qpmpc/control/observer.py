@@ -39,12 +39,10 @@ class Observer(NamedTuple):
     zero once all were seen for long.
 
     Attributes:
-        F, G, E, offset: the model of e.
-        H: the outputs of e.
+        F, G, E, offset, H: the model of e, and its outputs.
         S: the covariance of y - H e in the steady state, ``(n_y, n_y)``.
         P: the first P, zero without a log, ``(n_e, n_e)``.
-        gains: L_0, .., L_T, ``(T + 1, n_e, n_y)``; the last one is the steady one, and the only one
-            without a log.
+        gains: L_0, .., L_T, ``(T + 1, n_e, n_y)``: the steady one at last, alone without a log.
         start: the mean of e in the log, where a controller starts.
         rest: the map of [-G u - E d - offset; y] to the e that rests with u, d and y, where it
             starts without a log.
@@ -114,10 +112,9 @@ class Observer(NamedTuple):
 def kalman(design: Design, noise: Array, drift: Array) -> Observer:
     """Return the Kalman filter of a design's model, with its gains until it is steady.
 
-    The noise of the state and the outputs is that of an identification. Without one, white noise
-    acts on each input, with `SMALL` times its half range as standard deviation, and on each output.
     ``noise`` ``(n_y,)`` and ``drift`` ``(n_w,)`` are standard deviations of the outputs' noise and
-    of the disturbances' changes. The first state is one of the identification's log, with
+    of the disturbances' changes. The state's noise is the identification's, else that of inputs
+    with `SMALL` of their half ranges. The first state is one of the identification's log, with
     disturbances that move the outputs by `SMALL` of their usual deviations.
 
     Raises:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
-import torch
 
 from torch_qpmpc.control.design import DECIDES, Design, Target
 from torch_qpmpc.control.disturbance import TINY, unseen_modes
@@ -21,8 +20,6 @@ from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import SolverError
 from torch_qpmpc.export.tables import SINGULAR, make_tables
 from torch_qpmpc.qp.pipeline.condensing import null_space
-from torch_qpmpc.qp.program import Status
-from torch_qpmpc.qp.solve import solve_qp
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, HIDDEN = 0.3, 1e-3
@@ -35,16 +32,14 @@ OFFSET, SEEN, OUTSIDE = 1e-6, 1e-3, 0.05
 SHOWS = 0.03
 #: The length of the loop on levels, in horizons, of which the second half counts.
 PERIODS = 6
-#: Largest distance of outputs from the set-point that hard bounds are tried at, in half ranges.
-LARGEST = 2.0
 
 
 @dataclass(frozen=True)
 class Finding:
     """One question to a design.
 
-    It has the subject ``name``, whether it is ``ok``, the answer ``text``, the ``remedy`` of a
-    fault, and ``numbers`` for programs: what the outputs reach, and when they respond.
+    It has a ``name``, whether it is ``ok``, the answer ``text``, the ``remedy`` of a fault, and
+    ``numbers`` for programs: what the outputs reach, and when they respond.
     """
 
     name: str
@@ -56,10 +51,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Review:
-    """The ``findings`` about a controller; ``print`` shows them.
-
-    Those that need a definite cost or a stable loop are there with one.
-    """
+    """The ``findings`` about a controller; ``print`` shows them."""
 
     findings: list[Finding]
 
@@ -94,7 +86,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         *([_violation(design)] if design.violation else []),
         _horizon(design),
         _disturbances(design),
-        _hard_rows(mpc, r_last, known),
+        _hard_rows(design),
         set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
     findings += [_levels(law, r_last, known)] if design.levels else []
@@ -200,34 +192,14 @@ def _disturbances(design: Design) -> Finding:
     return Finding("disturbances", ok, text, remedy * (not ok))
 
 
-@torch.no_grad()
-def _hard_rows(mpc: LinearMPC, r: Array, known: Array) -> Finding:
-    """Outputs off the set-point, and last inputs at their bounds, leave a plan."""
-    design, n_y = mpc.design, len(mpc.design.Q)
-    half = np.diag(design.scaling.y)
-    off = np.linspace(0.05, LARGEST, 40)[:, None, None] * np.vstack((half, -half))
-    off = off.reshape(-1, n_y)
-    rest = mpc.target(r[0] if len(r) else design.middle, known=known)
-    of_y, _, of_x, _ = design.scaling
-    x = (off / of_y) @ np.linalg.pinv(design.normal.plant.C).T * of_x
-    x = rest.x.numpy() + np.vstack((x, np.zeros((2, len(of_x)))))
-    ends = np.where(np.isfinite(design.u_bounds), design.u_bounds, rest.u.numpy())
-    u_last = np.vstack((np.tile(rest.u, (len(off), 1)), ends))
-    stages = (len(x), mpc.horizon + 1) if design.staged else (len(x),)
-    target = Target(*(part.expand(*stages, -1) for part in rest))
-    ahead = np.tile(known, (len(x), mpc.horizon + 1, 1))
-    p = mpc.arrange(x, target, u_last=u_last, known=ahead)
-    status = solve_qp(mpc.plan.quadratic_program(), p, solver="daqp", on_failure="mask").status
-    hard = [i for i in design.bounded[0] if np.isinf(design.y_slack[i])]
-    names = ", ".join(design.plant.outputs[i] for i in hard)
-    failed = (status == Status.INFEASIBLE).nonzero().flatten().tolist()
-    if not failed:
-        text = f"Plans exist with outputs up to {LARGEST:g} half ranges off their set-points."
-        return Finding("hard bounds", True, text if names else "No output has a hard bound.")
-    at_y = (i := failed[0]) < len(off)
-    what = f"outputs {_listed(off[i])} off r" if at_y else f"last inputs {_listed(u_last[i])}"
-    text = f"There is no plan from {what}."
-    return Finding("hard bounds", False, text, f"Give {names} a finite y_slack.")
+def _hard_rows(design: Design) -> Finding:
+    """Rows with outputs, which noise and loads may put out of reach, have finite prices."""
+    rows = design.ends.beside(design.bands)
+    hard = np.isinf(rows.price) & rows.W[:, : len(design.Q)].any(1)
+    names = ", ".join(dict.fromkeys(rows.names[hard]))
+    text = f"There is no plan while noise or a load holds {names} outside the hard bounds."
+    remedy = f"Give {names} a finite y_slack." * bool(names)
+    return Finding("hard bounds", not names, text if names else "No output has one.", remedy)
 
 
 def _levels(law: Law, r: Array, known: Array) -> Finding:
@@ -263,10 +235,6 @@ class Setting(NamedTuple):
     w: Array
     known: Array
 
-    def target(self, r: Array) -> Target:
-        """Return the target of set-points ``(*batch, n_y)``."""
-        return self.mpc.target(r, self.w, self.known)
-
     def off(self, y: Array, r: Array) -> Array:
         """Return the mask of outputs with a weight that are off their set-points by a fault."""
         design, near = self.mpc.design, SEEN * self.mpc.design.scaling.y
@@ -294,10 +262,10 @@ def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
         if lower[i] > high[i] or upper[i] < low[i]:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
     if len(r_last) and design.Q.any():
-        r, target = r_last[-1], setting.target(r_last[-1])
+        r, target = r_last[-1], setting.mpc.target(r_last[-1], *setting[1:])
         y, size = target.y.numpy(), design.scaling.y
         if (off := setting.off(y, r)).any():  # soft bounds that the nearest one violates move it
-            y = setting.target(np.where(off, np.clip(y, low, high), r)).y.numpy()
+            y = setting.mpc.target(np.where(off, np.clip(y, low, high), r), *setting[1:]).y.numpy()
         for i in np.flatnonzero(setting.off(y, r)):
             word = f"{round(y[i], 4 - int(np.floor(np.log10(size[i])))):.10g}"
             limits = _limits(design, target, known)
@@ -307,18 +275,18 @@ def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
 
 def _limits(design: Design, target: Target, known: Array) -> str:
     """Return what a user can do about the bounds that a target is at."""
-    named, (of_y, of_u) = [], design.bounds_at(known, True)
-    for kind, names, bounds, x, size in (
-        ("y_bounds", design.plant.outputs, of_y, target.y.numpy(), design.scaling.y),
-        ("u_bounds", design.plant.inputs, of_u, target.u.numpy(), design.scaling.u),
-    ):
-        near = OFFSET * size
-        at = np.flatnonzero((x <= bounds[0] + near) | (x >= bounds[1] - near))
-        if len(at):
-            named.append(f"{kind} of {' and '.join(names[i] for i in at)}")
-    if not named:
-        return "as no inputs hold these set-points together"
-    return f"or widen {' or '.join(named)}"
+    bands, named = design.bands, []
+    x = bands.W @ np.concatenate((target.y.numpy(), target.u.numpy()))
+    near = OFFSET * np.abs(bands.W) @ np.append(design.scaling.y, design.scaling.u)
+    lower, upper = (
+        side + bands.K @ (known - design.nominal) for side in (bands.lower, bands.upper)
+    )
+    at = ((x <= lower + near) | (x >= upper - near)) & bands.W.any(1)
+    for argument in dict.fromkeys(bands.arguments[at]):
+        names = dict.fromkeys(bands.names[at & (bands.arguments == argument)])
+        named.append(f"{argument} of {' and '.join(names)}")
+    impossible = "as no inputs hold these set-points together"
+    return f"or widen {' or '.join(named)}" if named else impossible
 
 
 def _reach(setting: Setting) -> Array:
@@ -326,22 +294,23 @@ def _reach(setting: Setting) -> Array:
 
     Inputs are within their bounds, and other outputs without a weight in their zones, if they can.
     """
-    design = setting.mpc.design
+    design, bands, n_y = setting.mpc.design, setting.mpc.design.bands, len(setting.mpc.design.Q)
     steady, loads = design.steady, np.concatenate((setting.w, setting.known, [1.0]))
-    bands, of_u = design.bounds_at(setting.known)
-    zoned = np.diag(design.Q) == 0
-    S, size = np.vstack((steady.U, steady.Y)), np.concatenate((design.scaling.u, design.scaling.y))
-    rest = np.concatenate((steady.u @ loads, steady.y @ loads))
-    lower, upper = ((np.concatenate(side) - rest) / size for side in zip(of_u, bands, strict=True))
-    rows, limits = np.vstack((S, -S)) / np.tile(size, 2)[:, None], np.concatenate((upper, -lower))
-    ends = np.empty((len(zoned), 2))
-    for i, side in np.ndindex(len(zoned), 2):
+    S, rest = bands.W @ np.vstack((steady.Y, steady.U)), bands.W @ np.vstack((steady.y, steady.u))
+    (lower, upper), rest = bands.at(setting.known - design.nominal), rest @ loads
+    size = np.tile(bands.sizes(design.scaling.y, design.scaling.u), 2)
+    rows = np.vstack((S, -S)) / size[:, None]
+    limits = np.concatenate((upper - rest, rest - lower)) / size
+    of_y = bands.arguments == "y_bounds"
+    zones = of_y & ~(bands.W[:, :n_y] @ np.diag(design.Q)).astype(bool)
+    hard = ~of_y & np.isinf(bands.price)
+    ends = np.empty((n_y, 2))
+    for i, side in np.ndindex(n_y, 2):
         sign = 1 - 2 * side
-        zones = zoned & (np.arange(len(zoned)) != i)
-        for others in (zones, np.zeros_like(zones)):
-            kept = np.isfinite(limits) & np.tile(np.append(np.ones(len(steady.U), bool), others), 2)
+        for kept in (hard | (zones & (bands.W[:, i] == 0)), hard):
+            finite = np.isfinite(limits) & np.tile(kept, 2)
             c, own = sign * steady.Y[i] / design.scaling.y[i], {"bounds": (None, None)}
-            least = scipy.optimize.linprog(c, rows[kept], limits[kept], method="highs", **own)
+            least = scipy.optimize.linprog(c, rows[finite], limits[finite], method="highs", **own)
             if least.status != 2:  # infeasible
                 break
         otherwise = np.nan if least.status == 2 else -np.inf

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
 class Run:
     """Signals of a closed loop of T steps.
 
-    Attributes:
-        design: the controller's design.
-        y, r: measured outputs and set-points, ``(T + 1, n_y)``.
-        u, u_s: inputs, and those that hold the target, ``(T, m)``.
-        u_last, known: the input before the first step ``(m,)``, and known signals ``(T, n_d)``.
+    Of a controller's ``design`` it has measured outputs ``y`` and set-points ``r``,
+    ``(T + 1, n_y)``, inputs ``u`` and those that hold the target ``u_s``, ``(T, m)``, known signals
+    ``(T, n_d)``, and ``u_last``, the input before the first step ``(m,)``.
     """
 
     design: Design
@@ -157,13 +155,10 @@ def closed_loop(
 
 def _known(model: StateSpace, design: Design, d: Array) -> Array:
     """Return the rows of known signals that a model of a design's signals takes."""
-    got, want = model.sizes[1:3], design.plant.sizes[1:3]
-    if got != want:
-        got, want = (f"{m} inputs and {n_y} outputs" for m, n_y in (got, want))
-        raise QPError.expected("plant", got, f"the controller's {want}")
-    if len(model.known) not in (0, d.shape[1]):
-        got, want = f"{len(model.known)} known signals", f"none, or {d.shape[1]}"
-        raise QPError.expected("plant", got, want)
+    got, want = model.sizes[1:], (*design.plant.sizes[1:3], d.shape[1])
+    if got != want and got != (*want[:2], 0):
+        got, want = ("{} inputs, {} outputs, {} known signals".format(*x) for x in (got, want))
+        raise QPError.expected("plant", got, f"the controller's {want}, or none of the last")
     return d[:, : len(model.known)]
 
 

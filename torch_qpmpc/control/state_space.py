@@ -27,12 +27,10 @@ class StateSpace:
     """A discrete linear model, x+ = A x + B u + E d + offset with outputs y = C x.
 
     Attributes:
-        A, B, C, E: ``(n, n)``, ``(n, m)``, ``(n_y, n)`` and ``(n, n_d)``; d are known signals, such
-            as a measured disturbance or a price.
-        offset: ``(n,)``.
+        A, B, C, E, offset: ``(n, n)``, ``(n, m)``, ``(n_y, n)``, ``(n, n_d)`` and ``(n,)``; d are
+            known signals, such as a measured disturbance or a price.
         dt: the sampling time, or None.
-        inputs, outputs, known: names of the entries of u, y and d.
-        units: units by name, where known.
+        inputs, outputs, known, units: names of the entries of u, y and d, and units by name.
         noise: L ``(n, n_y)`` and S ``(n_y, n_y)`` of an identification, see `Innovations`.
         visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
         means: the means of its inputs and known signals, by name.

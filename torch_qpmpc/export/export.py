@@ -192,7 +192,7 @@ def _refuse(dtype: str, got: str, tables: Tables) -> None:
     remedy = "Export float64."
     if dtype == "float64":
         cost = f"The cost on the plan has condition {tables.condition:.1e}"
-        remedy = f"{cost}: shorten the horizon, or rescale the states."
+        remedy = f"{cost}: lower slack weights (y_slack), shorten the horizon, or rescale states."
     raise QPError.expected("dtype", f"{dtype!r}, with {got}", "a policy that agrees", remedy)
 
 
