@@ -24,42 +24,27 @@ class Near(NamedTuple):
     value: float
 
 
-#: Tolerances by dtype, of which `torch_qpmpc/export/policy.c` explains the use.
-CONSTANTS = {
-    "float64": {
-        "BIG": "1e300",
-        "TOLERANCE": "1e-11",
-        "TIGHT": "1e-14",
-        "EPSILON": "2.2e-16",
-        "ROUNDING": "4e-15",
-        "DEPENDENT": "1e-12",
-        "NOISE": "1e-10",
-        "FEASIBLE": "1e-8",
-        "KNOWN_FEASIBLE": "1e-6",
-        "GAP": "1e-9",
-        "GAIN": "1e-13",
-        "COARSE": "1e-7",
-    },
-    "float32": {
-        "BIG": "1e30f",
-        "TOLERANCE": "4e-6f",
-        "TIGHT": "4e-7f",
-        "EPSILON": "1.2e-7f",
-        "ROUNDING": "1e-6f",
-        "DEPENDENT": "1e-5f",
-        "NOISE": "1e-3f",
-        "FEASIBLE": "1e-4f",
-        "KNOWN_FEASIBLE": "1e-5f",
-        "GAP": "1e-4f",
-        "GAIN": "1e-6f",
-        "COARSE": "1e-4f",
-    },
+_CONSTANTS = {
+    "BIG": ("1e300", "1e30f"),
+    "TOLERANCE": ("1e-11", "4e-6f"),
+    "TIGHT": ("1e-14", "4e-7f"),
+    "EPSILON": ("2.2e-16", "1.2e-7f"),
+    "ROUNDING": ("4e-15", "1e-6f"),
+    "DEPENDENT": ("1e-12", "1e-5f"),
+    "NOISE": ("1e-10", "1e-3f"),
+    "FEASIBLE": ("1e-8", "1e-4f"),
+    "KNOWN_FEASIBLE": ("1e-6", "1e-5f"),
+    "GAP": ("1e-9", "1e-4f"),
+    "GAIN": ("1e-13", "1e-6f"),
+    "COARSE": ("1e-7", "1e-4f"),
 }
+REAL = {"float64": "double", "float32": "float"}
+#: Tolerances by dtype, of which `torch_qpmpc/export/policy.c` explains the use.
+CONSTANTS = {x: {key: pair[i] for key, pair in _CONSTANTS.items()} for i, x in enumerate(REAL)}
 #: Largest differences in the self-test, relative to the largest expected action and value.
 NEAR = {"float64": Near(1e-6, 1e-8), "float32": Near(1e-3, 1e-4)}
 #: The rounding of a value, in units in the last place of its terms, which may cancel.
 ROUNDING = 64
-REAL = {"float64": "double", "float32": "float"}
 WIDTH = 100
 
 
