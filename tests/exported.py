@@ -139,7 +139,6 @@ def random_qp(seed: int) -> Any:
         "n_p": n_p,
         "n_u": n_u,
         "constants": {},
-        "schedule": None,
         "sequential": None,
         "levels": None,
     }

@@ -33,11 +33,11 @@ BUDGET = {
     "analysis": 851,
     "control": 4712,
     "envs": 1432,
-    "experiment": 2985,
+    "experiment": 2925,
     "export": 1515,
     "learning": 2842,  # models that did not train theta decide in improve
-    "identification": 2633,  # learned dynamics, which blended.py is to pay for
-    "mpc": 4108,
+    "identification": 2633,
+    "mpc": 3880,
     "proofs": 1001,
     "qp": 5859,
     "study": 587,  # load_run(..).predict, which refinement's second start pays for

@@ -19,7 +19,6 @@ from torch_qpmpc.analysis.policy import local_gain, spectral_radius
 from torch_qpmpc.analysis.report import read
 from torch_qpmpc.analysis.structure import prediction_form, second_moment
 from torch_qpmpc.learning.gate import PairedTest
-from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.projections import nearest_psd, nearest_psd_by_sdp
 from torch_qpmpc.mpc.riccati import lqr_gain
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
@@ -145,9 +144,6 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "action": (lambda t: qm.identify(steps("action", t), 2), arx_log()["action"]),
     "reward": (
         lambda t: qm.QPMPC.from_data(steps(("next", "reward"), t), 2), torch.ones(3, 40, 1)
-    ),
-    "centres": (
-        lambda t: BlendedModel(t, [0.0] * 2, [1.0] * 2, 1.0, [A], [B], [[0.0] * 2]), [[0.0] * 2]
     ),
     "s": (lambda t: local_gain(scheme(), t), [[1.0, 0.5]]),
     "observation": (scheme().predict, [[1.0, 0.5]]),

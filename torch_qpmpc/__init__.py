@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
     from torch_qpmpc.learning.q_learning import QPQLearningLoss
     from torch_qpmpc.learning.theta_network import ThetaNetwork
-    from torch_qpmpc.mpc.blended import identify_blended
     from torch_qpmpc.mpc.bounds import Bounds
     from torch_qpmpc.mpc.cost import Cost
     from torch_qpmpc.mpc.layout import Layout
@@ -60,7 +59,6 @@ __all__ = [
     "export_c",
     "export_fmu",
     "identify",
-    "identify_blended",
     "identify_nonlinear",
     "improve",
     "load_run",
@@ -96,7 +94,6 @@ if not TYPE_CHECKING:
         "export_c": "torch_qpmpc.export.export:export_c",
         "export_fmu": "torch_qpmpc.export.fmu:export_fmu",
         "identify": "torch_qpmpc.identification.identification:identify",
-        "identify_blended": "torch_qpmpc.mpc.blended:identify_blended",
         "identify_nonlinear": "torch_qpmpc.identification.learned:identify_nonlinear",
         "improve": "torch_qpmpc.learning.closed_loop:improve",
         "load_run": "torch_qpmpc.study.runs:load_run",

@@ -410,7 +410,7 @@ def run(name: str, seed: int) -> dict[str, Any]:
     summary = start.summary
     row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
     row |= {"R2_cost": start.cost.R2 if start.cost else math.nan, "order": summary["order"]}
-    row |= {"reference": reference(PLANTS[name]), "transitions": 2 * cfg.start.transitions}
+    row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
     return row | {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
 
 
@@ -428,7 +428,7 @@ def learned(name: str, seed: int, start: float) -> dict[str, Any]:
         raise ValueError(f"{message}; delete the row to repeat it")
     steps = cfg.num_envs * (cfg.warmup_steps + cfg.updates * cfg.steps_per_update)
     entries = {"learned": summary["J_best"], "simulated": summary["simulated"]}
-    return entries | {"transitions": 2 * cfg.start.transitions + steps}
+    return entries | {"transitions": cfg.start.transitions + steps}
 
 
 def _costs(cfg: Config, physics: AnyPlant, policy: Any) -> torch.Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import signal
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -18,27 +17,24 @@ from torch.testing import assert_close
 import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
-from torch_qpmpc import QPError
+from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import (
-    BLENDED,
-    ESTIMATE,
-    FIRST,
-    OUTPUTS,
+    LINEAR,
+    NONLINEAR,
+    REGULATOR,
     STARTS,
     Choice,
-    below,
     candidates,
     choose,
-    chosen_before,
 )
-from torch_qpmpc.experiment.logs import estimated
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
+from torch_qpmpc.experiment.run_folder import CHECKPOINT
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.identification.steps import valid_steps
+from torch_qpmpc.identification import learned
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.riccati import terminal_riccati
 from torch_qpmpc.study.runs import FinishedRun
@@ -65,7 +61,7 @@ class Lag(gymnasium.Env):
 
 
 DATA = (*SMALL, "start=data", "start.transitions=400", "task=gymnasium", "task.id=Lag-v0")
-DATA += ("noise=none", "task.start_episodes=2")
+DATA += ("noise=none", "task.start_episodes=8")
 BOUNDED = "task.observation_bounds=true"
 #: Zero action is best: the input does next to nothing and is expensive.
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
@@ -93,107 +89,94 @@ def _plant(monkeypatch, known_starts):
 
     plant_is(monkeypatch, Lag)
     monkeypatch.setattr(choosing, "candidates", once)
+    monkeypatch.setattr(learned, "STEPS", 400)
 
 
 def chosen(*overrides):
     cfg = make_config(*overrides)
     physics: Any = make_physics(cfg)
-    log = collect_log(cfg, physics)
-    logs: Any
-    start, logs = choose(cfg, physics, log, partial(collect_log, cfg, physics))
+    start = choose(cfg, physics, collect_log(cfg, physics))
     assert start.choice is not None
-    assert torch.equal(logs[: len(log)]["action"], log["action"])
-    assert len(logs) == 2 * len(log)
     return cfg, physics, start, start.choice
 
 
 def start_of(cfg, physics):
     """Return the MPC of a log, with zero action held."""
-    start = candidates(cfg, physics, collect_log(cfg, physics))[OUTPUTS]
+    start = candidates(cfg, physics, collect_log(cfg, physics))[LINEAR]
     return start._replace(action=torch.zeros(1, dtype=torch.float64))
 
 
-def test_the_candidates_have_the_regulators_cost(monkeypatch):
+def test_the_candidates_have_the_stage_s_and_the_regulator_s_cost(monkeypatch):
     plant_is(monkeypatch, Swing)
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
     log = collect_log(cfg, physics)
     named = candidates(cfg, physics, log)
-    assert [*named] == [ESTIMATE, OUTPUTS]
-    assert [start.order > 1 for start in named.values()] == [True, False]
-    for start in named.values():
-        mpc = make_mpc(cfg, start.plant(physics), start)
-        assert start.cost is not None
-        A, B = (torch.tensor(part) for part in start.model[:2])
-        P = terminal_riccati(A, B, start.cost.W, mpc.gamma, mpc.layout)
-        assert_close(mpc.H_f.double(), P, rtol=1e-6, atol=1e-6)
+    assert [*named] == [LINEAR, REGULATOR], "no network predicts a linear plant"
+    mpcs = {name: make_mpc(cfg, start.plant(physics), start) for name, start in named.items()}
+    start, mpc = named[LINEAR], mpcs[LINEAR]
+    assert start.order > 1
+    assert start.cost is not None
+    assert_close(mpc.H_f.double(), start.cost.W[: mpc.n_x, : mpc.n_x], rtol=1e-6, atol=1e-6)
+    A, B = (torch.tensor(part) for part in start.model[:2])
+    P = terminal_riccati(A, B, start.cost.W, mpc.gamma, mpc.layout)
+    assert_close(mpcs[REGULATOR].H_f.double(), P, rtol=1e-6, atol=1e-6)
     diagonal = make_config(*DATA, "task.hessian=diagonal")
-    assert not any(start.riccati for start in candidates(diagonal, physics, log).values())
+    assert [*candidates(diagonal, physics, log)] == [LINEAR]
 
 
 def test_a_start_that_costs_less_than_zero_action_is_chosen():
-    cfg, _, start, choice = chosen(*DATA, "task.start_episodes=6")
+    cfg, _, start, choice = chosen(*DATA)
     rows = choice.table
     assert start.action is None
-    assert {OUTPUTS, f"{OUTPUTS}{FIRST}", ZERO_ACTION} <= {*rows.index}
-    assert rows.episodes[choice.name] == rows.episodes[ZERO_ACTION] == 6
-    assert rows.J[choice.name] < rows.J[ZERO_ACTION]
-    assert rows.episodes.tolist()[:3] == [6, 6, 6]
+    assert {*rows.index} == {LINEAR, REGULATOR, ZERO_ACTION}
+    assert rows.episodes.tolist()[2:] == [8]
+    assert rows.index[0] == choice.name == choice.scheme
+    assert rows.episodes[choice.name] == rows.episodes[ZERO_ACTION] == 32, "the test needs 29"
     steps = rows.episodes.sum() * cfg.task.eval_steps
     assert start.summary["start_transitions"] == steps
-    assert f"{steps:,} transitions beside the logs'" in str(choice)
+    assert f"{steps:,} transitions beside the log's" in str(choice)
 
 
-def test_the_second_log_is_the_policys_with_exploration():
+class Certain(Lag):
+    """A lag without chance, whose episodes are equal."""
+
+    def reset(self, *, seed=None, options=None):
+        self.y = np.full(1, 3.0)
+        return self.y, {}
+
+    def step(self, action):
+        self.y = 0.9 * self.y + self.gain * action
+        return self.y, -(self.y.item() ** 2) - self.price * np.abs(action).item(), False, False, {}
+
+
+def test_equal_episodes_decide_at_once(monkeypatch):
+    plant_is(monkeypatch, Certain)
+    choice = chosen(*DATA)[-1]
+    assert choice.name != ZERO_ACTION
+    assert choice.table.episodes.tolist() == [8, 8, 8]
+
+
+def test_a_log_of_ones_own_is_kept_and_the_run_resumes_with_it(tmp_path):
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
-    log = collect_log(cfg, physics)
-    start = candidates(cfg, physics, log)[OUTPUTS]
-    second = collect_log(cfg, physics, start)
-    assert second.shape == log.shape
-    y, u = second["observation"], second["action"]
-    assert u.abs().max() <= 1
-    assert torch.equal(
-        y[:, 1:][~second["next", "done"][:, :-1, 0]],
-        second["next", "observation"][:, :-1][~second["next", "done"][:, :-1, 0]],
-    )
-    x = estimated(second, start.model)["observation"]
-    policy = make_mpc(cfg, start.plant(physics), start).policy
-    away = u.double() - policy(x.flatten(0, 1)).reshape(u.shape)
-    assert 0.05 < away.std() < 0.3
-    assert away.abs().max() < 0.3 + 1e-6
-    assert y.square().mean() < 0.7 * log["observation"].square().mean()
-
-
-def test_a_log_of_ones_own_is_the_first_one(tmp_path):
-    """It has other episodes, steps and entries than the second, and the run resumes with both."""
-    cfg = make_config(*DATA)
-    physics: Any = make_physics(cfg)
-    whole: Any = collect_log(cfg, physics).select("observation", "action", "next")
-    own = whole[:1, :50].reshape(5, 10)
-    torch.save(own.exclude(("next", "truncated")).to_dict(), tmp_path / "own.pt")
+    own: Any = collect_log(cfg, physics).select("observation", "action", "next")
+    torch.save(own[:1, :50].reshape(5, 10).to_dict(), tmp_path / "own.pt")
     cfg.start.file = str(tmp_path / "own.pt")
-    start = make_start(cfg, physics, tmp_path / "run", written=False)
-    again = make_start(cfg, physics, tmp_path / "run", written=True)
-    assert start is not None
-    assert again is not None
-    assert again.choice is not None
-    assert start.choice is not None
+    start: Any = make_start(cfg, physics, tmp_path / "run", written=False)
+    again: Any = make_start(cfg, physics, tmp_path / "run", written=True)
     pd.testing.assert_frame_equal(again.choice.table, start.choice.table, check_names=False)
     np.testing.assert_array_equal(again.model.A, start.model.A)
-    logs = below(own, own[..., :-1])
-    assert len(logs) == 2 * 5
-    assert (~valid_steps(logs)).sum() == 5
 
 
 def test_zero_action_is_held_if_nothing_costs_less(tmp_path):
     cfg, physics, start, choice = chosen(*HOPELESS)
-    choice.write(tmp_path)
-    again: Any = chosen_before(cfg, physics, start.log, tmp_path)
+    again = choose(cfg, physics, collect_log(cfg, physics), choice=choice)
     assert start.action is not None
+    assert again.action is not None
     assert torch.equal(again.action, start.action)
     assert choice.name == start.summary["start"] == ZERO_ACTION
-    assert choice.scheme != ZERO_ACTION
+    assert choice.scheme in (LINEAR, REGULATOR)
     plant: Any = start.plant(physics)
     s = 3 * torch.randn(16, plant.n_x, dtype=torch.float64)
     assert make_mpc(cfg, plant, start).policy(s).abs().max() < 1e-12
@@ -244,35 +227,68 @@ def trained(cfg, folder) -> FinishedRun:
     return run
 
 
-class Turning(Lag):
-    """A lag whose gain changes its sign between the starts and zero."""
+def check_predict(run):
+    """Run episodes by ``run.predict``, which holds the filter and the plan."""
+    for seed in (5, 6):
+        options: Any = {"steps": 20, "starts": 1, "seed": seed}
+        loop = gymnasium_loop(warm_policy(run.policy), run.physics, **options)
+        env = run.physics.make()
+        (y, _), costs = env.reset(seed=seed), []
+        for k in range(len(loop.costs)):
+            y, reward, *_ = env.step(run.predict(y, begins=k == 0))
+            costs.append(-float(reward))
+        assert costs == pytest.approx(loop.costs[:, 0].tolist(), rel=1e-4, abs=1e-6)
+
+
+class Periodic(Lag):
+    """An angle with a stage cost that no quadratic fits; the nearest minima are 1 and 1 - 2 pi."""
 
     def step(self, action):
-        self.y = 0.95 * self.y + 0.5 * np.cos(self.y) * action
-        return self.y, -(self.y.item() ** 2), False, False, {}
+        cost, self.y = 1 - np.cos(self.y.item() - 1), self.y + 0.5 * action
+        return self.y, -cost, False, False, {}
 
 
 @pytest.fixture
-def turning(monkeypatch):
-    plant_is(monkeypatch, Turning)
+def periodic(monkeypatch):
+    plant_is(monkeypatch, Periodic)
 
 
-@pytest.mark.usefixtures("turning")
-def test_a_run_starts_from_blended_models_and_its_file_has_them(tmp_path):
-    settings = ("optimizer=gauss_newton", "constraint=mpc")
-    run = trained(make_config(*DATA, *settings), tmp_path)
-    assert run.summary["start"].startswith(BLENDED)
-    assert run.policy.schedule is not None
-    assert run.start.schedule is not None
+@pytest.mark.usefixtures("periodic")
+def test_a_run_starts_from_networks_learns_the_cost_and_resumes(tmp_path, monkeypatch, capsys):
+    """It says that C and b are not learned; nor is C's deviation penalised."""
+    settings = ("optimizer=gauss_newton", "batch_size=64", "gate=true", "eval_interval=2")
+    cfg, cut = make_config(*DATA, *settings, "constraint=deviation"), tmp_path / "cut"
+    run = trained(cfg, tmp_path / "whole")
+    assert run.summary["start"] == NONLINEAR
+    assert run.start.sequential is not None
+    assert run.start.horizon == 2 * cfg.task.horizon
+    check_predict(run)
+    assert run.policy.learned == ("H", "H_f", "q", "c")
+    learner = QPMPC.load(tmp_path / "whole" / CHECKPOINT)
+    assert learner.c != run.start.c
+    assert torch.equal(learner.C, run.start.C)
+    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    run_command(*DATA, *settings, "constraint=deviation", f"hydra.run.dir={cut}")
+    said = capsys.readouterr().out
+    assert "C and of b, which are not learned. theta's cost is, from 32 transitions" in said
+    resumed = FinishedRun(cut)
+    for key in ("J_start", "J_best", "start", "accepted", "rejected"):
+        assert run.summary[key] == resumed.summary[key]
 
 
-@pytest.mark.usefixtures("turning")
-@pytest.mark.parametrize(("si", "there"), [("null", True), ("{beta: 1.0, windows: 2}", False)])
-def test_blended_models_are_no_start_of_a_run_that_needs_one_C(si, there):
-    cfg = make_config(*DATA, f"constraint.si={si}")
+@pytest.mark.usefixtures("periodic")
+@pytest.mark.parametrize(
+    ("settings", "there"),
+    [
+        ((), True),
+        (("constraint.si={beta: 1.0, windows: 2}",), False),
+        (("task.learn_cost=[]", "constraint=free"), False),
+    ],
+)
+def test_networks_are_no_start_of_a_run_that_needs_C(settings, there):
+    cfg = make_config(*DATA, *settings)
     physics: Any = make_physics(cfg)
-    named = candidates(cfg, physics, collect_log(cfg, physics))
-    assert any("blended" in name for name in named) == there
+    assert (NONLINEAR in candidates(cfg, physics, collect_log(cfg, physics))) == there
 
 
 class Swing(Lag):
@@ -307,13 +323,7 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
     assert plant.n_x == run.policy.n_x == run.summary["order"] == len(run.observer.A) >= 2
     assert run.summary["J_start"] < 25, "16 with both states known, 37 by feedback of the position"
     assert "constraint=mpc" in repr(run)
-    for seed in (5, 6):  # run.predict holds the filter
-        loop, env = gymnasium_loop(run.policy.policy, plant, starts=1, seed=seed), plant.make()
-        (y, _), costs = env.reset(seed=seed), []
-        for k in range(len(loop.costs)):
-            y, reward, *_ = env.step(run.predict(y, begins=k == 0))
-            costs.append(-float(reward))
-        assert costs == pytest.approx(loop.costs[:, 0].tolist(), rel=1e-6, abs=1e-9)
+    check_predict(run)
     assert repr(FinishedRun(tmp_path)) == f"<run {tmp_path}>", "without a run"
     with pytest.raises(QPError, match=r"observation: got shape \(4,\), expected shape"):
         run.predict(np.zeros(4))
@@ -324,7 +334,7 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
         run_command(*DATA, *settings, f"hydra.run.dir={cut}")
     (tmp_path / STARTS).rename(cut / STARTS)
     with monkeypatch.context() as patch:
-        patch.setattr("torch_qpmpc.experiment.start.choose", None)
+        patch.setattr(choosing, "_compared", None)
         run_command(*DATA, *settings, f"hydra.run.dir={cut}")
     resumed = FinishedRun(cut)
     constants = [x.policy.c.item() for x in (run, resumed)]
@@ -343,12 +353,12 @@ def table(*rows: tuple[Any, ...], names: list[str]) -> pd.DataFrame:
 
 
 def test_the_table_is_kept_and_damage_is_named(tmp_path):
-    rows = (4, 2.0, 0.0, 40, False), (4, 0.1 + 0.2, 1 / 3, 40, True)
-    choice = Choice(table(*rows, names=[ZERO_ACTION, "a, b"]))
+    rows = (8, 2.0, 0.0, 40, True), (8, 0.1 + 0.2, 1 / 3, 40, False)
+    choice = Choice(table(*rows, names=[ZERO_ACTION, LINEAR]))
     choice.write(tmp_path)
     again = Choice.read(tmp_path)
-    assert again.summary == {"start": "a, b", "start_transitions": 80}
-    assert again.scheme == "a, b"
+    assert again.summary == {"start": ZERO_ACTION, "start_transitions": 80}
+    assert again.scheme == LINEAR
     pd.testing.assert_frame_equal(again.table, choice.table, check_names=False, check_exact=True)
     again.table["chosen"] = False
     again.write(tmp_path)
@@ -356,9 +366,9 @@ def test_the_table_is_kept_and_damage_is_named(tmp_path):
         Choice.read(tmp_path)
 
 
-def test_a_table_of_other_logs_is_named(tmp_path):
+def test_a_table_of_another_log_is_named():
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
-    Choice(table((4, 1.0, 0.1, 40, True), names=["MPC"])).write(tmp_path)
-    with pytest.raises(QPError, match=r"starts\.csv: got 'MPC', expected one of MPC of the"):
-        chosen_before(cfg, physics, collect_log(cfg, physics), tmp_path)
+    other = Choice(table((8, 1.0, 0.1, 40, True), names=["MPC"]))
+    with pytest.raises(QPError, match=r"starts\.csv: got 'MPC', expected one of linear MPC"):
+        choose(cfg, physics, collect_log(cfg, physics), choice=other)

@@ -15,9 +15,10 @@ from torch.testing import assert_close
 import torch_qpmpc as qm
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.learning.operators import QPActorValueOperator, warm_policy
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
-from torch_qpmpc.mpc.nonlinear import PlanSolution
+from torch_qpmpc.mpc.nonlinear import PlanSolution, of_networks
 from torch_qpmpc.proofs import Polytope, largest_difference
 
 N = 5
@@ -55,6 +56,35 @@ def made(known: bool = False, priced: bool = False, **options: Any) -> QPMPC:
 def states(mpc: QPMPC, count: int = 4, size: float = 0.6, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return size * torch.randn(count, mpc.n_p, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("n_d", [0, 1])
+@pytest.mark.parametrize("priced", [True, False])
+def test_derivatives_are_those_of_automatic_differentiation(n_d, priced):
+    rng = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+    n, m, K, width = n_d + 3, 2 + priced, 2, 4
+    layers = [random(n, K * width), random(K * width), random(K, width, width)]
+    layers += [random(K, 1, width), random(K * width, m), random(m)]
+    size = 1 + n + priced * n * (n + 1) // 2
+    for own in ((), layers):
+        model = LearnedModel(random(n), random(n).exp(), random(size, m), 2, own)
+        w = random(5, n)
+
+        def outputs(w: Tensor, model: LearnedModel = model) -> Tensor:
+            d, x, u = w.split((n_d, 2, 1), -1)
+            out = model(x, u, *(d,) * n_d)
+            return torch.cat((out[0], out[1][..., None]), -1) if isinstance(out, tuple) else out
+
+        J, W = of_networks(model, w)
+        J[:, :2, n_d : n_d + 2] += torch.eye(2)  # x+ is x and its change
+        assert_close(J, torch.func.vmap(torch.func.jacrev(outputs))(w))
+        if priced:
+            cost = torch.func.hessian(lambda w: outputs(w)[-1])
+            assert_close(W, torch.func.vmap(cost)(w))
 
 
 def test_runge_and_kutta_are_of_fourth_order():

@@ -99,7 +99,7 @@ def read(
         at: the state of the policy's gain, ``(n_p,)``; the origin by default.
 
     Raises:
-        QPError: if C has no prediction form or a schedule, or an argument does not fit.
+        QPError: if C has no prediction form, if there are dynamics, or if an argument does not fit.
         SolverError: if the QP has no solution there, and ``mpc.on_failure`` is ``"raise"``.
 
     Example:

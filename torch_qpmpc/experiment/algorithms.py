@@ -18,6 +18,7 @@ from torch_qpmpc.envs.closed_loop import ClosedLoop
 from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant
+from torch_qpmpc.experiment.tasks.identified import FEWER
 from torch_qpmpc.identification.steps import valid_steps
 from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
@@ -99,6 +100,7 @@ def make_penalties(
 ) -> tuple[DeviationPenalty | None, SystemIdentificationPenalty | None]:
     """Make the deviation and the SI penalty; None for each that is off."""
     own, si = cfg.constraint.deviation, cfg.constraint.si
+    own = own if mpc.sequential is None else None  # no C is learned
     return (
         own and DeviationPenalty(mpc, c_1=own.c_1, c_2=own.c_2, c_3=own.c_3),
         si and SystemIdentificationPenalty(si.beta),
@@ -162,7 +164,7 @@ def make_run_replay(cfg: Config, mpc: QPMPC) -> Replay:
     return Replay(
         cfg.replay_capacity,
         cfg.num_envs,
-        cfg.batch_size,
+        cfg.batch_size if mpc.sequential is None else min(cfg.batch_size, FEWER),
         cfg.task.horizon,
         1 if si is None else si.windows,
         seed=cfg.seed,

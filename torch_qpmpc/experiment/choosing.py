@@ -1,49 +1,38 @@
-"""The choice of a start: two logs of the plant, and closed loops with the models of both."""
+"""The choice of a start: linear and nonlinear MPC of a log, beside zero action on the plant."""
 
 from __future__ import annotations
 
-import contextlib
-import math
-from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import pandas as pd
 import torch
-from scipy.special import stdtrit
-from tensordict import TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
-from torch_qpmpc.experiment.logs import below
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
-from torch_qpmpc.experiment.tasks.identified import Start, identified_start
+from torch_qpmpc.experiment.tasks.identified import Start, identified_start, nonlinear_start
 from torch_qpmpc.files import damaged, write_whole
+from torch_qpmpc.learning.gate import PairedTest
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.mpc.blended import identify_blended
 
-#: Episodes of each start in the first round.
-FEW = 4
 #: The seeds of the episodes begin this far above the run's seed, away from an evaluation's.
 APART = 10**6
-#: The probability with which the chosen start costs less than zero action.
-CONFIDENCE = 0.95
-#: Blended models are among the starts if they leave less than this share of the held-out variance
-#: that one model leaves unexplained.
-BLENDED_SHARE = 0.8
+#: The probability that a start which is no better than zero action is chosen; and the most episodes
+#: of each, in ``task.start_episodes``.
+ALPHA, MOST = 0.05, 8
 #: The names of the candidates.
-ESTIMATE, OUTPUTS, BLENDED = "MPC of the estimate", "MPC of the outputs", "blended models"
-#: The end of the names of starts that are identified from the first log alone.
-FIRST = ", first log"
+LINEAR, REGULATOR, NONLINEAR = "linear MPC", "linear MPC, regulator's end", "nonlinear MPC"
 #: The table in a run's folder.
 STARTS = "starts.csv"
 NOTHING = (
-    "No start is shown to cost less than zero action, which is the start. Perhaps no scheme "
-    "of these logs controls the plant: pass a log about the states where the controller is to work "
+    "No candidate beats zero action, so learning starts from it. Perhaps no scheme of this log "
+    "controls the plant: pass a log about the states where the controller is to work "
     "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
     "plant's own cost (task.stage_weight), or a theta from a network: 'Scheduled and nonlinear "
     "plants' in the guides."
@@ -51,7 +40,7 @@ NOTHING = (
 
 
 class Choice(NamedTuple):
-    """The starts by name, best first, one of them ``chosen``: J, its standard ``error``, the count.
+    """The candidates by name, best first, one of them ``chosen``: J, its ``error``, the counts.
 
     The ``transitions`` are at most the steps of the ``episodes``.
     """
@@ -66,8 +55,9 @@ class Choice(NamedTuple):
 
     @property
     def scheme(self) -> str:
-        """The name of the best start that is not zero action, with which learning begins."""
-        return next(name for name in self.table.index if name != ZERO_ACTION)
+        """The name of the chosen scheme or, with zero action, of the best linear one."""
+        linear = (name for name in self.table.index if name in (LINEAR, REGULATOR))
+        return next(linear) if self.name == ZERO_ACTION else self.name
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -78,14 +68,9 @@ class Choice(NamedTuple):
     def __str__(self) -> str:
         words: Any = dict.fromkeys(("J", "error"), cost_text)
         rows = self.table.to_string(columns=["episodes", *words], formatters=words)
-        count = f"{self.summary['start_transitions']:,} transitions beside the logs'"
+        count = f"{self.summary['start_transitions']:,} transitions beside the log's"
         lines = [rows, f"Chosen by at most {count}: {self.name}"]
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
-
-    def of(self, start: Start, physics: AnyPlant) -> Start:
-        """Return the start of `scheme`, which holds zero action if that is chosen."""
-        action = zero_action(physics)(physics.lb_a[None])[0]
-        return start._replace(action=action if self.name == ZERO_ACTION else None, choice=self)
 
     def write(self, folder: Path) -> None:
         """Write the table into a run's folder."""
@@ -105,94 +90,77 @@ class Choice(NamedTuple):
 
 
 def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
-    """Return at most three starts of a log by name.
-
-    They are MPC of the estimate and of the outputs, each with the regulator's cost of x_N, and, at
-    twice the horizon, models of the outputs that are blended where the plant is nonlinear.
-    """
-    estimate, N = identified_start(cfg, physics, log), cfg.task.horizon
-    outputs = estimate if not estimate.order else identified_start(cfg, physics, log, order=0)
-    named = ({ESTIMATE: estimate} if estimate.order else {}) | {OUTPUTS: outputs}
-    for name, start in named.items() if cfg.task.hessian != "diagonal" else ():
-        with contextlib.suppress(QPError):  # the model and the cost have no regulator
-            regulated = start._replace(riccati=start.cost is not None)
+    """Return the starts of a log by name: linear MPC, with each cost of x_N, and nonlinear MPC."""
+    start = identified_start(cfg, physics, log)
+    named = {LINEAR: start}
+    if start.cost is not None and cfg.task.hessian != "diagonal":
+        with suppress(QPError):  # the model and the cost have no regulator
+            regulated = start._replace(riccati=True)
             make_mpc(cfg, start.plant(physics), regulated)
-            named[name] = regulated
-    if not outputs.layout.n_d and cfg.constraint.si is None:
-        blended = identify_blended(outputs.log, 2 * N)
-        unexplained = {count: 1 - R2 for count, R2 in blended.R2.items()}
-        if min(unexplained.values()) < BLENDED_SHARE * unexplained[1]:
-            named[BLENDED] = outputs._replace(horizon=2 * N, blended=blended)
+            named[REGULATOR] = regulated
+    if (nonlinear := nonlinear_start(cfg, physics, log)) is not None:
+        named[NONLINEAR] = nonlinear
     return named
 
 
 def choose(
-    cfg: Config,
-    physics: AnyPlant,
-    log: Any,
-    explored: Callable[[Start], TensorDictBase],
-    quiet: bool = True,
-) -> tuple[Start, TensorDictBase]:
-    """Choose a start by closed loops on the plant; return it and the logs, one below the other.
+    cfg: Config, physics: AnyPlant, log: Any, quiet: bool = True, choice: Choice | None = None
+) -> Start:
+    """Return the best of the `candidates`, or zero action, by closed loops on the plant.
 
-    The `candidates` of the log have the same 4 episodes; ``explored`` collects a second log with
-    the best one, and the candidates of both logs have these episodes, too. Then the best two have
-    ``task.start_episodes`` in all, as zero action has. The best one is chosen if it costs less than
-    zero action by a one-sided paired t-test of 95 %; if not, zero action is.
+    All have the same episodes. The best one then has more of them, beside zero action, until the
+    gate's test decides: it is chosen if it costs less. A run that goes on has made its ``choice``.
     """
-    costs: dict[str, Tensor] = {}
-    few, steps = min(FEW, cfg.task.start_episodes), 0
+    named = candidates(cfg, physics, log)
+    if choice is None:
+        with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
+            choice = _compared(cfg, physics, named, bar)
+    if (start := named.get(choice.scheme)) is None:
+        raise QPError.expected(STARTS, f"{choice.scheme!r}", f"one of {', '.join(named)}")
+    action = zero_action(physics)(physics.lb_a[None])[0]
+    return start._replace(action=action if choice.name == ZERO_ACTION else None, choice=choice)
 
-    def run(names: Iterable[str], count: int) -> None:
+
+def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any) -> Choice:
+    """Compare the candidates with each other, and the best one with zero action."""
+    costs: dict[str, Tensor] = {}
+    few, steps = cfg.task.start_episodes, 0
+
+    def run(name: str) -> None:
+        """Add ``few`` episodes to the costs."""
         nonlocal steps
-        for name in names:
-            done = costs.get(name, torch.zeros(0, dtype=torch.float64))
-            if len(done) == count:
-                continue
-            plant = named[name].plant(physics)
-            if name == ZERO_ACTION:
-                policy = zero_action(plant)
-            else:
-                policy = warm_policy(make_mpc(cfg, plant, named[name]))
-            options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma}
-            options |= {"starts": count - len(done), "seed": APART + cfg.seed + len(done)}
-            loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
-            costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
-            steps = len(loop)
-            bar.update()
+        bar.set_postfix_str(name)
+        start, done = named.get(name), costs.get(name, torch.zeros(0, dtype=torch.float64))
+        plant = physics if start is None else start.plant(physics)
+        policy = zero_action(plant) if start is None else warm_policy(make_mpc(cfg, plant, start))
+        options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma, "starts": few}
+        options["seed"] = APART + cfg.seed + len(done)
+        loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
+        costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
+        steps = len(loop)
+        bar.update()
 
     def J(name: str) -> float:
         return costs[name].mean().item()
 
-    def error(x: Tensor) -> float:
-        return (x.std() / math.sqrt(len(x))).item()
-
-    with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
-        named = {f"{name}{FIRST}": start for name, start in candidates(cfg, physics, log).items()}
-        run(named, few)
-        log = below(log, explored(named[min(named, key=J)]))
-        second = candidates(cfg, physics, log)
-        named |= second
-        run(second, few)
-        finalists = sorted(named, key=J)[:2]
-        named[ZERO_ACTION] = named[finalists[0]]
-        run((*finalists, ZERO_ACTION), cfg.task.start_episodes)
-    best = min(finalists, key=J)
-    gain = costs[best] - costs[ZERO_ACTION]
-    bound = gain.mean() + float(stdtrit(len(gain) - 1, CONFIDENCE)) * error(gain)
-    chosen = best if gain.mean() == -math.inf or bound < 0 else ZERO_ACTION
-    rows = [(len(x), J(name), error(x), steps * len(x)) for name, x in costs.items()]
-    table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions"])
-    table["chosen"] = table.index == chosen
-    choice = Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))
-    return choice.of(named[best], physics), log
-
-
-def chosen_before(cfg: Config, physics: AnyPlant, log: TensorDictBase, folder: Path) -> Start:
-    """Return the start that the run in ``folder`` has chosen from its logs."""
-    choice = Choice.read(folder)
-    first = choice.scheme.endswith(FIRST)
-    named = candidates(cfg, physics, log[: -cfg.num_envs] if first else log)
-    if (start := named.get(choice.scheme.removesuffix(FIRST))) is None:
-        raise QPError.expected(STARTS, f"{choice.scheme!r}", f"one of {', '.join(named)}")
-    return choice.of(start, physics)
+    for name in (*named, ZERO_ACTION):
+        run(name)
+    best, better = min(named, key=J), False
+    while not better and J(best) < J(ZERO_ACTION):
+        zero = costs[ZERO_ACTION]
+        gain = torch.where(zero.isfinite(), costs[best] - zero, -torch.inf)
+        test = PairedTest(2 * ALPHA)
+        test.add(gain)
+        # The episodes of a plant without chance are equal.
+        better = test.decision == "better" or gain.max() - gain.min() <= 1e-9 * gain.abs().mean()
+        if better or test.decision == "worse" or len(gain) >= MOST * few:
+            break
+        run(best)
+        run(ZERO_ACTION)
+    chosen = best if better else ZERO_ACTION
+    rows = [
+        (len(x), J(name), (x.std() / len(x) ** 0.5).item(), steps * len(x), name == chosen)
+        for name, x in costs.items()
+    ]
+    table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions", "chosen"])
+    return Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))

@@ -1,11 +1,9 @@
-"""Operations on a log of TorchRL: cut where it blows up, joined with another, and filtered."""
+"""Operations on a log of TorchRL: cut where it blows up, and filtered."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from tensordict import TensorDictBase, pad
+from tensordict import TensorDictBase
 
 from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.identification.innovations import Innovations
@@ -38,20 +36,6 @@ def without_blow_ups(log: TensorDictBase) -> tuple[TensorDictBase, int]:
     masked = log.clone(recurse=False)
     masked["mask"] = (valid_steps(rows) & (count == 0)).reshape(log.shape)
     return masked, int((bad & (count == 1)).sum())
-
-
-def below(first: TensorDictBase, second: TensorDictBase) -> TensorDictBase:
-    """Return two logs, ``(T,)`` or ``(episodes, T)``, one below the other; padding is masked.
-
-    Entries that only one has, as in a log of one's own, are left out.
-    """
-    logs = [log if log.batch_dims == 2 else log.unsqueeze(0) for log in (first, second)]
-    steps = max(log.shape[1] for log in logs)
-    logs = [log.clone(recurse=False).set("mask", valid_steps(log)) for log in logs]
-    logs = [pad(log, [0, 0, 0, steps - log.shape[1]]) for log in logs]
-    common = set.intersection(*({*log.keys(True, True)} for log in logs))
-    both: Any = torch.cat([log.select(*common) for log in logs])
-    return both
 
 
 def estimated(log: TensorDictBase, observer: Innovations) -> TensorDictBase:

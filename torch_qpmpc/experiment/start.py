@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import io
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torch_qpmpc.envs import KalmanFilter
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.choosing import choose, chosen_before
+from torch_qpmpc.experiment.choosing import Choice, choose
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.logs import without_blow_ups
-from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.learning.replay import Replay
 
-#: The share of the exploration that a second log adds to the actions of the best start.
-MIXED = 0.3
 #: The log in a run's folder.
 LOG = "log.pt"
 #: The model of a run's observer in its folder.
@@ -87,10 +81,8 @@ def make_start(
         log = collect_log(cfg, physics)
     if not cfg.task.start_episodes:
         start = identified_start(cfg, physics, log)
-    elif written:
-        start = chosen_before(cfg, physics, log, path.parent)
     else:
-        start, log = choose(cfg, physics, log, partial(collect_log, cfg, physics), quiet)
+        start = choose(cfg, physics, log, quiet, Choice.read(path.parent) if written else None)
     if not written:
         buffer = io.BytesIO()
         torch.save(log.to_dict(), buffer)
@@ -117,28 +109,13 @@ def learning_start(cfg: Config, start: Start | None) -> Start | None:
 
 
 @torch.no_grad()
-def collect_log(cfg: Config, physics: AnyPlant, start: Start | None = None) -> TensorDict:
-    """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments.
-
-    With a ``start``, its policy acts, and `MIXED` times the exploration is added. The observations
-    are the plant's own.
-    """
-    low, high, options = physics.lb_a, physics.ub_a, cfg.start
-    seed = cfg.seed + (start is not None)
-    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=seed)
-    explore: Any = Exploration(low, high, options.hold, options.levels == "binary", seed)
-    policy, key = explore, "observation"
-    if start is not None:
-        if start.observer is not None:
-            key = "estimate"
-            env = env.append_transform(KalmanFilter(start.observer, estimate_key=key))
-        act, middle = warm_policy(make_mpc(cfg, start.plant(physics), start)), (low + high) / 2
-
-        def policy(x: Tensor) -> Tensor:
-            u = act(x.double()) + MIXED * (explore(x.double()) - middle)
-            return u.clamp(low, high).to(x.dtype)
-
-    module = TensorDictModule(policy, [key], ["action"])
+def collect_log(cfg: Config, physics: AnyPlant) -> TensorDict:
+    """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments."""
+    options = cfg.start
+    env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
+    binary = options.levels == "binary"
+    explore = Exploration(physics.lb_a, physics.ub_a, options.hold, binary, cfg.seed)
+    module = TensorDictModule(explore, ["observation"], ["action"])
     steps = -(-options.transitions // cfg.num_envs)
     log = env.rollout(steps, module, break_when_any_done=False).contiguous()
     env.close()

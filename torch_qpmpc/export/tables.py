@@ -124,7 +124,7 @@ def make_tables(mpc: QPMPC) -> Tables:
     """Make the tables of the current theta.
 
     Raises:
-        QPError: theta is not finite, has crossed bounds or a schedule, or its cost is singular on
+        QPError: theta is not finite, has crossed bounds or dynamics, or its cost is singular on
             the plan.
     """
     check_one_model(mpc)

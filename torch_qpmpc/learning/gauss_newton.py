@@ -186,7 +186,7 @@ class GaussNewton(torch.optim.Optimizer):
             root = root * inverse_variance(s, a, solution.value, delta, use).sqrt()
         # The root of a weight scales its pair's row, both its error and its gradient.
         delta = root * delta
-        # Theta's own parts: the change of a schedule is constant in theta.
+        # Theta's own parts: what dynamics add is constant in theta.
         solution = replace(solution, qp=qp)
         blocks = self._blocks(solution, root, None if penalty is None else count * penalty)
         scale(blocks, count)

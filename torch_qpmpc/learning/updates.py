@@ -39,7 +39,7 @@ def first_order(
     A loss or gradient that is not finite changes nothing either. Penalties that are None are off.
 
     Raises:
-        QPError: the SI penalty is of one C for all states, and the QPMPC has a schedule.
+        QPError: the SI penalty is of one C for all states, and the QPMPC has dynamics.
     """
     if si is not None:
         check_one_model(mpc)
@@ -80,7 +80,7 @@ def second_order(
 
     Raises:
         QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
-            of the QP's own theta. Or the QPMPC has a schedule and an SI penalty.
+            of the QP's own theta. Or the QPMPC has dynamics and an SI penalty.
     """
     if si is not None:
         check_one_model(mpc)

@@ -6,7 +6,6 @@ All values are costs to go, as in the paper; rewards appear only in `torch_qpmpc
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -22,7 +21,6 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.identification.identification import measured_model, model_arguments
 from torch_qpmpc.mpc import parameters
-from torch_qpmpc.mpc.blended import BlendedModel, schedule_of
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
@@ -88,8 +86,6 @@ class QPMPC(nn.Module):
             itself, which `project_` corrects after each step, by eigenvalues or by a semidefinite
             program; see `torch_qpmpc.mpc.projections`.
         solver, on_failure: see `solve_qp`.
-        schedule: a model from `identify_blended`, or its arguments. Its linearisation at s replaces
-            the scheme's model: theta gets the differences of C(s) and b(s) from the scheme's.
         dynamics: the function x+ = f(x, u) that replaces the scheme's model, or f(x, u, d) with a
             preview, of tensors ``(*batch, n_x)``, ``(*batch, n_u)`` and ``(*batch, n_d)``; it may
             return the pair of x+ and a stage cost ``(*batch,)``, which is added to theta's. V is
@@ -104,7 +100,6 @@ class QPMPC(nn.Module):
             levels, and its gradient that of the best plan's QP.
         C_0: the banded C of the initial model, ``(N n_x, n_z)``.
         sequential: the `SequentialQP` of the dynamics; None without any.
-        schedule: the `BlendedModel`, a copy of the one passed; None without one.
         n_p: the number of entries of p, (N + 1) n_d + n_x.
 
     Raises:
@@ -136,8 +131,6 @@ class QPMPC(nn.Module):
     ub: Tensor
     w: Tensor
     C_0: Tensor
-    C_start: Tensor
-    b_start: Tensor
     discount: Tensor
     slack_discount: Tensor
     soft: Tensor
@@ -154,7 +147,6 @@ class QPMPC(nn.Module):
         step: str = CHOLESKY,
         solver: str = "proxqp",
         on_failure: str = "raise",
-        schedule: BlendedModel | Mapping[str, Tensor] | None = None,
         dynamics: Callable[..., Any] | None = None,
         iterations: int = 30,
     ) -> None:
@@ -174,7 +166,6 @@ class QPMPC(nn.Module):
         self.n_p, self.n_z = self.layout.n_p, self.layout.n_z
         self.hessian, self.structure, self.step = scheme.cost.hessian, structure, step
         self.solver, self.on_failure = solver, on_failure
-        self.schedule = None if schedule is None else schedule_of(schedule, self.layout)
         check_dynamics(dynamics, learn, scheme.bounds.action_levels)
         self.sequential = None
         if dynamics is not None:
@@ -191,9 +182,6 @@ class QPMPC(nn.Module):
         self._masks = learned_entries(learn, theta)
         self.register_buffer("C_0", self.scheme.C_0.clone())
         self.register_buffer("soft", theta["w"].isfinite())
-        if self.schedule is not None:
-            self.register_buffer("C_start", theta["C"].clone())
-            self.register_buffer("b_start", theta["b"].clone())
         self._derive()
         # A hard row's entry is a placeholder: inf as a parameter would have NaN gradients.
         theta["w"] = theta["w"].masked_fill(~self.soft, 0.0)
@@ -414,7 +402,7 @@ class QPMPC(nn.Module):
         """Return A and B, ``(n_x, n_x)`` and ``(n_x, n_u)``, and with a preview E ``(n_x, n_d)``.
 
         Raises:
-            QPError: C is free, and need not contain a model; or there is a schedule.
+            QPError: C is free, and need not contain a model; or there are dynamics.
         """
         check_one_model(self)
         if self.structure == "free":
@@ -450,8 +438,6 @@ class QPMPC(nn.Module):
 
     def quadratic_program(self, residuals: Mapping[str, Tensor] | None = None) -> QuadraticProgram:
         """Return the current theta as a QuadraticProgram, with discounts (eq:qpH).
-
-        It leaves out the schedule, which each solve adds at its s.
 
         Args:
             residuals: tensors ``(*batch, ..)``, such as the outputs of a network, that are added to
@@ -608,7 +594,7 @@ class QPMPC(nn.Module):
             dynamics = self.sequential.dynamics
             options["dynamics"] = getattr(dynamics, "arguments", dynamics)
             options["iterations"] = self.sequential.iterations
-        return options if self.schedule is None else options | {"schedule": self.schedule.arguments}
+        return options
 
     def checked_state(self, state_dict: dict[str, Any], prefix: str) -> dict[str, Any]:
         """Return ``state_dict``, whose keys begin with ``prefix``, with an identity if it has none.
@@ -661,8 +647,6 @@ class QPMPC(nn.Module):
             check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = fixed.to(qp.C.dtype)
-        if self.schedule is not None:
-            qp = self._scheduled(qp, fixed[..., : self.n_p])
         on_failure = on_failure or self.on_failure
         if self.sequential is not None:
             return self.sequential.solve(qp, fixed, n_kept, self.solver, on_failure, warm_start)
@@ -672,7 +656,7 @@ class QPMPC(nn.Module):
 
     @torch.no_grad()
     def at_rest(self) -> AtRest:
-        """Return what solves V's QPs with today's theta, without the schedule, one by one."""
+        """Return a solver of V's QPs, one by one, that keeps the current theta prepared."""
         check_no_levels(self, "solves at rest")
         return AtRest(self.quadratic_program(), self.n_p, self.n_p + self.n_u, self.solver)
 
@@ -682,7 +666,7 @@ class QPMPC(nn.Module):
         From none, it does not depend on earlier calls, so that a resumed run repeats it. The
         preparation is kept until theta changes; it is None, too, if that cannot be seen.
         """
-        if any(x is not None for x in (self.schedule, self.levels, self.sequential)):
+        if self.levels is not None or self.sequential is not None:
             return None
         leaves, at_rest = vars(self).get("_at_rest", (None, None))
         if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:
@@ -693,16 +677,6 @@ class QPMPC(nn.Module):
         solution = at_rest.solve(x.reshape(1, -1).astype(np.float64), warm)
         u = solution.z[0, self.n_p : self.n_p + self.n_u]
         return None if solution.status[0] else u.reshape(*x.shape[:-1], -1).astype(x.dtype)
-
-    def _scheduled(self, qp: QuadraticProgram, s: Tensor) -> QuadraticProgram:
-        """Return ``qp`` with the schedule's changes of C and b at s."""
-        assert self.schedule is not None
-        with full_precision(self.C_0):
-            C, b = self.schedule.constraints(s, self.horizon)
-            C, b = C - self.C_start, b - self.b_start
-        more = qp.b.shape[-1] - b.shape[-1]  # rows of blocks
-        C, b = qp.C + F.pad(C, (0, 0, 0, more)), qp.b + F.pad(b, (0, more))
-        return replace(qp, C=C, b=b, check_values=False)
 
     def _action(self, solution: QPSolution, dtype: torch.dtype) -> Tensor:
         """Return u_0 of a solution of V's QP."""

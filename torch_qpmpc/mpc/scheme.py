@@ -23,7 +23,7 @@ GAMMA = 0.9
 #: Keyword arguments of `QPMPC` that no scheme has.
 KEYWORDS = ("learn", "structure", "step", "solver", "on_failure")
 #: Those of models in place of A and B.
-MODELS = ("schedule", "dynamics", "iterations")
+MODELS = ("dynamics", "iterations")
 
 
 @dataclass(frozen=True, eq=False)

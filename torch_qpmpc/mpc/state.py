@@ -45,7 +45,6 @@ def identity(mpc: Any) -> dict[str, Any]:
         "hard rows": digest(mpc.scheme.theta["w"].isinf()),
         "action_levels": mpc.levels and repr(mpc.levels.identity),
         "dynamics": None if mpc.sequential is None else type(mpc.sequential.dynamics).__name__,
-        "centres": None if mpc.schedule is None else len(mpc.schedule.centres),
     }
 
 

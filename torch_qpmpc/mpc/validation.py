@@ -62,13 +62,10 @@ def learned_entries(learn: Collection[str], theta: Mapping[str, Tensor]) -> dict
 
 
 def check_one_model(mpc: Any) -> None:
-    """Raise `QPError` if a QPMPC has a schedule or dynamics, so that its C and b depend on s."""
+    """Raise `QPError` if a QPMPC has dynamics, so that its C and b depend on s."""
     if mpc.sequential is not None:
         want = "one with A and B, for one C"
         raise QPError.expected("mpc", "one with dynamics", want, "mpc.C is that of the origin.")
-    if mpc.schedule is not None:
-        got, want = "one with a schedule", "one with the same C and b for all states"
-        raise QPError.expected("mpc", got, want, "Its model at s is mpc.schedule.linearised(s).")
 
 
 def check_dynamics(dynamics: Any, learn: Collection[str], levels: Any) -> None:

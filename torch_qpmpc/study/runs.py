@@ -40,6 +40,7 @@ from torch_qpmpc.experiment.start import read_observer
 from torch_qpmpc.experiment.tasks import AnyPlant, make_physics, make_true_mpc
 from torch_qpmpc.experiment.tasks.code import has_run
 from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
@@ -67,15 +68,14 @@ class FinishedRun:
             text += f", J {J['J_start']:.4g} to {J['J_best']:.4g}"
         return f"{text}>"
 
+    @torch.no_grad()
     def predict(self, observation: Any, begins: bool = False) -> np.ndarray:
         """Return the learned policy's action ``(*batch, n_u)`` for the next observation.
 
-        A run that started from a log acts on the estimate of its `observer`, which remembers the
-        observations and actions before.
+        A run that started from a log acts on its `observer`'s estimate, and remembers the steps.
 
         Args:
-            observation: ``(*batch, n)`` of episodes side by side: the output, after the known
-                signals if there are some.
+            observation: ``(*batch, n)``, the output, after the known signals if there are some.
             begins: True for the first observation of an episode; the first call begins one, too.
 
         Raises:
@@ -88,11 +88,13 @@ class FinishedRun:
         d, y = check_tensor("observation", p, split + len(model.C)).tensor_split([split], -1)
         if begins or not self._last:
             x = (kalman := KalmanFilter(model)).first(y)
+            own = self.policy
+            act = own.predict if own.sequential is None else warm_policy(own)
         else:
-            kalman, x, u, known, k = self._last
+            kalman, act, x, u, known, k = self._last
             x = kalman.following(x, u, known, y, k)
-        u = torch.as_tensor(self.policy.predict(torch.cat((d, x), -1)))
-        self._last = kalman, x, u, d[..., : model.E.shape[-1]], k + 1
+        u = torch.as_tensor(act(torch.cat((d, x), -1)))
+        self._last = kalman, act, x, u, d[..., : model.E.shape[-1]], k + 1
         return u.numpy()
 
     @cached_property

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from typing import Any
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings, find_task
@@ -21,7 +22,6 @@ from torch_qpmpc.experiment.tasks.registry import (
     priced,
     register,
 )
-from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import Scheme
 
@@ -56,7 +56,10 @@ def make_mpc(cfg: Config, physics: AnyPlant, start: Start | None = None) -> QPMP
     masks = task.masks(cfg, physics)
     learned = (*cfg.task.learn_cost, *cfg.constraint.learn)
     learn = {part: masks.get(part, True) for part in learned}
-    return _make(cfg, scheme, learn, None if start is None else start.blended)
+    if start is None or start.dynamics is None:
+        return _make(cfg, scheme, learn)
+    learn = {part: mask for part, mask in learn.items() if part not in ("C", "b")}
+    return _make(cfg, scheme, learn, dynamics=start.dynamics, iterations=1)
 
 
 def make_true_mpc(cfg: Config, physics: AnyPlant) -> QPMPC | None:
@@ -65,12 +68,7 @@ def make_true_mpc(cfg: Config, physics: AnyPlant) -> QPMPC | None:
     return None if true_scheme is None else _make(cfg, true_scheme(cfg, physics), ())
 
 
-def _make(
-    cfg: Config,
-    scheme: Scheme,
-    learn: Collection[str],
-    schedule: BlendedModel | None = None,
-) -> QPMPC:
+def _make(cfg: Config, scheme: Scheme, learn: Collection[str], **options: Any) -> QPMPC:
     if not scheme.is_complete:
         got = f"{cfg.task.name!r}, whose scheme has no model or no stage weight"
         raise QPError.expected("task.name", got, "a scheme with both", "Or use start=data.")
@@ -85,5 +83,5 @@ def _make(
         step=cfg.step,
         solver=cfg.solver,
         on_failure="mask",
-        schedule=schedule,
+        **options,
     )

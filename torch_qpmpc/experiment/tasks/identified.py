@@ -19,10 +19,10 @@ from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks.registry import AnyPlant
 from torch_qpmpc.identification.identification import check_excitation, measured_model
 from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.identification.learned import LearnedModel, fit_learned
 from torch_qpmpc.identification.reading import as_log
-from torch_qpmpc.identification.steps import MEASURED, valid_steps
+from torch_qpmpc.identification.steps import MEASURED, NEXT, valid_steps
 from torch_qpmpc.identification.subspace import fit_state_space
-from torch_qpmpc.mpc.blended import BlendedModel
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
@@ -41,6 +41,17 @@ from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 if TYPE_CHECKING:
     from torch_qpmpc.experiment.choosing import Choice
 
+#: The most transitions of an update of a nonlinear scheme.
+FEWER = 32
+#: A nonlinear plan, whose cost has no end, looks so many times as far ahead.
+FARTHER = 2
+#: The weight of an action in a nonlinear scheme, relative to the costs of the log, for one minimum.
+TINY = 1e-6
+NETWORKS = (
+    "Networks take the place of this model, of C and of b, which are not learned. theta's cost is, "
+    f"from {FEWER} transitions an update, because a nonlinear plan takes as long as many QPs."
+)
+
 
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
@@ -48,8 +59,8 @@ class Start(NamedTuple):
     The observation of ``log`` is the state of ``model``: where the plant is ``observed``, the
     estimate by its filter; ``order`` is as in `fit_state_space`. ``cut`` is the number of the log's
     episodes that blow up. ``action`` ``(n_u,)`` is what the policy holds, by a cost of its
-    own. ``choice`` is the table of starts that it was chosen from, ``blended`` the QP's schedule.
-    ``riccati`` is True if the cost of x_N is the regulator's.
+    own. ``choice`` is the table that it was chosen from, ``dynamics`` the networks in place of
+    ``model``. ``riccati`` is True if the cost of x_N is the regulator's.
     """
 
     log: Any
@@ -61,7 +72,7 @@ class Start(NamedTuple):
     cut: int = 0
     action: Tensor | None = None
     choice: Choice | None = None
-    blended: BlendedModel | None = None
+    dynamics: LearnedModel | None = None
     riccati: bool = False
 
     @property
@@ -84,11 +95,9 @@ class Start(NamedTuple):
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
         poles = ", ".join(f"{abs(pole):.3g}" for pole in self.model.poles)
-        count = 0 if self.blended is None else len(self.blended.centres)
-        blended = f"Linear models at {count} centres, blended, take the place of the model above."
         parts = [cut] * (self.cut > 0)
         parts += [f"Model of order {len(self.model.A)}, with poles of sizes {poles}"]
-        parts += [blended] * (count > 0)
+        parts += [NETWORKS] * (self.dynamics is not None)
         if self.cost is not None:
             R2 = self.cost.R2
             parts += [f"stage cost fitted to the rewards: R2 {R2:.3f}"]
@@ -129,10 +138,29 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     return start._replace(cost=fit_rewards(steps, start.layout, diagonal, start.model))
 
 
+def nonlinear_start(cfg: Config, physics: AnyPlant, log: Any) -> Start | None:
+    """Return nonlinear MPC of the outputs of a log; None if no network predicts them better.
+
+    None, too, with known signals, or where C and b, which it lacks, are needed.
+    """
+    rest = {*cfg.task.learn_cost, *cfg.constraint.learn} - {"C", "b"}
+    if isinstance(physics, LinearSystem | Plant) or cfg.constraint.si is not None or not rest:
+        return None
+    start = identified_start(cfg, physics, log, order=0)
+    kept = valid_steps(start.log)
+    x, u, after = (start.log[key].double()[kept] for key in ("observation", "action", NEXT))
+    cost = None if start.cost is None else -_rewards(start.log)[kept]
+    model = fit_learned(torch.cat((x, u), -1), x, after, cost)
+    horizon = FARTHER * start.horizon
+    return start._replace(horizon=horizon, dynamics=model) if model.depth else None
+
+
 def identified_scheme(cfg: Config, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
     cost = scheme.cost
-    if cost.stage_weight is None:
+    if cost.stage_weight is None and start.dynamics is not None:
+        cost = _cost_of_networks(cfg, start)
+    elif cost.stage_weight is None:
         cost = _observed_cost(cfg, start)
         if start.riccati or cfg.task.terminal_weight == "riccati":
             cost = regulator_cost(cost, start, scheme.gamma)
@@ -196,9 +224,31 @@ def _observed_cost(cfg: Config, start: Start) -> Cost:
     fitted = start.cost or fit_rewards(log, layout, diagonal, start.model)
     cost = scheme_cost(fitted, layout, gamma, cfg.task.hessian)
     if gamma < 1:
-        mean = -log["next", "reward"].reshape(log.shape)[valid_steps(log)].double().mean()
-        cost = replace(cost, c=cost.c + gamma ** (layout.horizon + 1) / (1 - gamma) * mean)
+        cost = replace(cost, c=cost.c + _ahead(log, gamma, layout.horizon + 1))
     return cost
+
+
+def _cost_of_networks(cfg: Config, start: Start) -> Cost:
+    """Return theta's cost beside that of the dynamics: next to none."""
+    gamma, layout, log = cfg.task.gamma, start.layout, start.log
+    weight = torch.zeros(layout.n, dtype=torch.float64)
+    kept = valid_steps(log)
+    size = log["action"][kept].double().square().mean(0)
+    weight[layout.n_x :] = TINY * _rewards(log)[kept].abs().mean() / size
+    dense = cfg.task.hessian != "diagonal"
+    c = _ahead(log, gamma, layout.horizon) if gamma < 1 else 0.0
+    terminal = torch.zeros(layout.n_x, dtype=torch.float64)
+    parts = [torch.diag(x) if dense else x for x in (weight, terminal)]
+    return Cost(*parts, cfg.task.hessian, c=c)
+
+
+def _ahead(log: TensorDictBase, gamma: float, k: int) -> Tensor:
+    """Return the discounted costs from stage k on, each the mean of the log's."""
+    return -(gamma**k) / (1 - gamma) * _rewards(log)[valid_steps(log)].mean()
+
+
+def _rewards(log: TensorDictBase) -> Tensor:
+    return log["next", "reward"].double().reshape(log.shape)
 
 
 def nominal_mpcs(cfg: Config, physics: AnyPlant, data: Sequence[TensorDictBase]) -> list[QPMPC]:
