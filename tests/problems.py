@@ -209,7 +209,8 @@ def certified(p: Programs, *claim: Tensor, compiled: bool = True) -> tuple[Tenso
     left[:, : xi.shape[-1]] += xi
     terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
     if not compiled:
-        return sample_torch.judge(z, lam, chi, *in_torch(p), terms)
+        arguments = z, lam, chi, *in_torch(p), terms
+        return sample_torch.judge(*arguments)
     arrays = Terms._make(x.contiguous().numpy() for x in terms)
     found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), arrays)
     return (*map(torch.from_numpy, found),)

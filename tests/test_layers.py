@@ -33,8 +33,8 @@ BUDGET = {
     "analysis": 851,
     "control": 4712,
     "envs": 1432,
-    "experiment": 2925,
-    "export": 1515,
+    "experiment": 2905,
+    "export": 1500,
     "learning": 2842,  # models that did not train theta decide in improve
     "identification": 2633,
     "mpc": 3880,

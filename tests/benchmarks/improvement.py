@@ -23,7 +23,6 @@ import train
 from tests.benchmarks.table import DOCS
 from tests.runs import make_config
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
@@ -67,7 +66,7 @@ CASES = {
 }
 
 
-def configuration(case: Case, seed: int) -> Config:
+def configuration(case: Case, seed: int) -> Any:
     """Compose the configuration of a run."""
     cfg = make_config(*COMMON, *case.overrides, f"seed={seed}")
     cfg.eval_interval = cfg.updates
@@ -85,7 +84,7 @@ def fixed_costs(case: str) -> dict[str, float]:
     return {"other": other, "reference": np.nan if reference is None else J[reference]}
 
 
-def trained(case: Case, seed: int) -> tuple[Config, int, dict[str, Any]]:
+def trained(case: Case, seed: int) -> tuple[Any, int, dict[str, Any]]:
     """Train once; return the configuration, the size of a log of its own, and the summary."""
     cfg, logged = configuration(case, seed), 0
     with tempfile.TemporaryDirectory() as folder:

@@ -371,7 +371,7 @@ PLANTS = {
 }
 
 
-def configuration(name: str, seed: int, *overrides: str) -> Config:
+def configuration(name: str, seed: int, *overrides: str) -> Any:
     """Compose the configuration of a plant's documented command."""
     plant = PLANTS[name]
     own = ("task=gymnasium", f"task.id={plant.id}", "start=data", f"seed={seed}")

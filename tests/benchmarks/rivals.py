@@ -272,7 +272,7 @@ class Scenarios:
         self.of = torch.tensor(scipy.linalg.toeplitz(pulse, np.zeros(HORIZON)))
         self.constant = torch.tensor(np.cumsum([(C @ F @ offset)[0] for F in powers[:-1]]))
         parts = ([x.numpy() for x in one] for one in found.log.trajectories)
-        errors = np.concatenate([found.model.errors(*part, HORIZON)[..., 0] for part in parts])
+        errors = np.concatenate([found.model.errors(y, u, d, HORIZON)[..., 0] for y, u, d in parts])
         self.errors = torch.tensor(errors[np.isfinite(errors).all(1)])
         self.plant, self.rng, self.u = plant, torch.Generator().manual_seed(seed), None
 

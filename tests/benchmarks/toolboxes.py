@@ -53,8 +53,8 @@ def ours() -> Policy:
 
 def do_mpc() -> Policy:
     """Return do-mpc's policy, with CasADi and IPOPT."""
-    import casadi
-    import do_mpc
+    import casadi  # pyright: ignore[reportMissingImports]
+    import do_mpc  # pyright: ignore[reportMissingImports]
 
     model = do_mpc.model.Model("discrete")
     x, u = model.set_variable("_x", "x", shape=(2, 1)), model.set_variable("_u", "u")
@@ -76,7 +76,7 @@ def do_mpc() -> Policy:
 
 def gekko() -> Policy:
     """Return GEKKO's policy, with APOPT on this machine."""
-    from gekko import GEKKO
+    from gekko import GEKKO  # pyright: ignore[reportMissingImports]
 
     m = GEKKO(remote=False)
     start = [m.Param(0.0) for _ in range(2)]
@@ -104,9 +104,9 @@ def gekko() -> Policy:
 
 def ampyc() -> Policy:
     """Return ampyc's policy, with CVXPY."""
-    from ampyc.controllers import MPC
-    from ampyc.noise import ZeroNoise
-    from ampyc.systems import LinearSystem
+    from ampyc.controllers import MPC  # pyright: ignore[reportMissingImports]
+    from ampyc.noise import ZeroNoise  # pyright: ignore[reportMissingImports]
+    from ampyc.systems import LinearSystem  # pyright: ignore[reportMissingImports]
 
     rows, both = np.vstack((np.eye(2), -np.eye(2))), np.array([[1.0], [-1.0]])
     plant = {"n": 2, "m": 1, "A": A, "B": B, "C": np.eye(2), "D": np.zeros((2, 1))}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def noise(kind: str, rng: np.random.Generator, steps: int) -> np.ndarray:
     return e
 
 
-def identified(kind: str, seed: int, steps: int = 600) -> qm.Identified:
+def identified(kind: str, seed: int, steps: int = 600) -> Any:
     """Return the model of a log of the tank."""
     rng = np.random.default_rng([seed, 1])
     w, v = noise(kind, rng, steps), 0.02 * rng.normal(size=steps)
@@ -60,7 +61,7 @@ def rates(seeds: int, steps: int) -> str:
     """Return the table: the rate in % with its 95 % interval over the seeds, and the cost."""
     head = ["noise", "none asked", *(f"{share:.0%} asked" for share in SHARES[1:])]
     rows: list[list[str]] = []
-    bounds = {"y_bounds": (0.0, BOUND), "u_bounds": (0.0, 10.0)}
+    bounds: Any = {"y_bounds": (0.0, BOUND), "u_bounds": (0.0, 10.0)}
     for kind in KINDS:
         runs = np.zeros((seeds, len(SHARES), 2))
         for seed in range(seeds):

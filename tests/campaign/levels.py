@@ -90,13 +90,14 @@ def highs(one: Mixed) -> tuple[float, float]:
     fixed = one.ends[0] == one.ends[1]
     assert not one.H[np.ix_(~fixed, ~fixed)].any()
     at = np.where(fixed, one.ends[0], 0.0)
-    limits = optimize.LinearConstraint(one.D, one.lower, one.upper)
+    rows: Any = one.D, one.lower, one.upper
     options = {"mip_rel_gap": 1e-9, "time_limit": SECONDS}
+    ends: Any = one.ends
     best = optimize.milp(
         one.cost + one.H @ at,
         integrality=one.integer,
-        bounds=optimize.Bounds(*one.ends),
-        constraints=limits,
+        bounds=optimize.Bounds(*ends),
+        constraints=optimize.LinearConstraint(*rows),
         options=options,
     )
     rest = one.constant - at @ one.H @ at / 2
@@ -105,12 +106,12 @@ def highs(one: Mixed) -> tuple[float, float]:
 
 def scip(one: Mixed) -> tuple[float, float]:
     """Return the cost of SCIP's best plan and its lower bound."""
-    from pyscipopt import Model, quicksum
+    from pyscipopt import Model, quicksum  # pyright: ignore[reportMissingImports]
 
     model = Model()
     model.hideOutput()
-    for name, x in (("limits/time", SECONDS), ("limits/gap", 1e-8), ("numerics/feastol", 1e-9)):
-        model.setParam(name, x)
+    for name, size in (("limits/time", SECONDS), ("limits/gap", 1e-8), ("numerics/feastol", 1e-9)):
+        model.setParam(name, size)
     x: list[Any] = [
         model.addVar(
             vtype="BC"[int(not whole)],

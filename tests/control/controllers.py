@@ -26,7 +26,7 @@ SOUND = 0.02
 
 def learned(references: str = "held", rate: float = 1e-3, **options) -> qm.LinearMPC:
     """Make a LinearMPC with bounds, prices and names of which every part has been learned."""
-    names = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
+    names: Any = {"inputs": ["valve"], "outputs": ["level"], "known": ["rain", "price"]}
     plant = read_model((A, B, C), np.hstack((E, 0 * E)), **names)
     mpc = qm.LinearMPC(
         replace(plant, units={"level": "m"}, dt=0.5),

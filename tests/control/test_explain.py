@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ KNOWN = {"d": np.linspace(1.0, 2.0, 9), "most": np.linspace(1.95, 1.2, 9)}
 
 
 def controller(**options) -> qm.Controller:
-    names = {"inputs": ["q"], "outputs": ["T", "h"], "known": ["d", "most"]}
+    names: Any = {"inputs": ["q"], "outputs": ["T", "h"], "known": ["d", "most"]}
     plant = read_model((A, B), E=[[0.1, 0.0], [0.0, 0.0]], **names)
     plant = replace(plant, units={"T": "degC", "q": "kW"})
     design = {
@@ -96,7 +97,7 @@ def test_the_plan_is_drawn():
     made = stepped()
     axes = made.explain().plot().axes
     assert [x.get_ylabel() for x in axes][:2] == ["T [degC]", "h"]
-    assert len(axes[0].lines[0].get_ydata()) == 9
+    assert np.shape(axes[0].lines[0].get_ydata()) == (9,)
 
 
 def test_faulty_steps_are_told_in_words():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,8 +171,8 @@ def test_a_gain_of_one_s_own_places_the_observer_s_poles(form, tmp_path):
     mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 8, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
 
     def placed(F, H):
-        predictor = scipy.signal.place_poles(F.T, H.T, [0.2, 0.3]).gain_matrix.T
-        return np.linalg.solve(F, predictor)
+        found: Any = scipy.signal.place_poles(F.T, H.T, [0.2, 0.3])
+        return np.linalg.solve(F, found.gain_matrix.T)
 
     o = qm.Controller(mpc).observer
     gain = placed if form == "function" else placed(o.F, o.H)

@@ -64,7 +64,9 @@ def test_a_redesign_a_file_and_the_review_know_it(model, tmp_path):
 
 def test_c_keeps_the_same_distance(model, tmp_path):
     controller = made(model, 0.05)
-    assert controller.export_c(tmp_path).difference < 1e-8
+    difference = controller.export_c(tmp_path).difference
+    assert difference is not None
+    assert difference < 1e-8
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,8 @@ def test_a_weight_is_of_the_observations_where_the_log_s_model_has_hidden_states
     cfg = make_config("task=pendulum", "start=data")
     A, B, E, C = np.eye(5), np.zeros((5, 1)), np.zeros((5, 0)), np.eye(3, 5)
     rest = np.zeros(5), C, C.T, np.eye(3), np.zeros(5), np.eye(5)
-    scheme = given_scheme(cfg, make_physics(cfg).observed(Innovations(A, B, E, *rest)))
+    plant: Any = make_physics(cfg)
+    scheme = given_scheme(cfg, plant.observed(Innovations(A, B, E, *rest)))
     weight = scheme.cost.stage_weight
     own = torch.tensor(cfg.task.stage_weight, dtype=torch.float64)
     assert weight is not None

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,7 +43,7 @@ def test_a_launcher_runs_the_study(launcher, tmp_path):
     launch = (f"hydra/launcher={launcher}", *LAUNCHERS[launcher])
     overrides = arguments(tmp_path, "seed=1,2", *launch)
     # Ray's workers have a low priority by default and would wait for other tests.
-    variables = {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
+    variables: Any = {"PYTHONPATH": str(ROOT), "RAY_worker_niceness": "0"}
     ended(sys.executable, "train.py", *overrides, **variables)
     summaries = [json.loads(path.read_text()) for path in tmp_path.glob("*/summary.json")]
     assert sorted(summary["seed"] for summary in summaries) == [1, 2]

@@ -156,7 +156,8 @@ class Greenhouse(gymnasium.Env):
 
 @pytest.mark.filterwarnings("ignore:.*stage cost explains")
 def test_a_slow_plant_with_a_hidden_state_takes_few_qps_an_update(tmp_path, monkeypatch):
-    spec = EnvSpec("Greenhouse-v0", Greenhouse, max_episode_steps=200)
+    make: Any = Greenhouse
+    spec = EnvSpec("Greenhouse-v0", make, max_episode_steps=200)
     monkeypatch.setitem(gymnasium.registry, "Greenhouse-v0", spec)
     plant = ("task=gymnasium", "task.id=Greenhouse-v0", "start=data", "task.start_episodes=0")
     plain = ("rivals=false", "figures=false", "gate=false", "task.eval_steps=5")

@@ -7,6 +7,7 @@ import runpy
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,7 +27,7 @@ MODEL = ([[0.9, 0.05], [0.0, 0.8]], [[0.5], [0.2]], np.eye(2))
 
 def controller(**options) -> qm.Controller:
     """Return a controller with names, units, forecasts, soft bounds and bounds of moves."""
-    names = {"inputs": ["q"], "outputs": ["T", "h"], "known": ["d", "price"]}
+    names: Any = {"inputs": ["q"], "outputs": ["T", "h"], "known": ["d", "price"]}
     plant = read_model(MODEL, E=[[0.1, 0.0], [0.0, 0.0]], **names)
     bounds = {"u_bounds": (0.0, 2.0), "du_bounds": (-0.7, 0.7), "y_bounds": {"T": (-1.0, 6.0)}}
     mpc = qm.LinearMPC(
@@ -239,7 +240,7 @@ def test_an_fmu_is_a_plant(tmp_path):
     variables = [Variable("q", "input", 0.0, ""), Variable("T", "output", 0.0, "")]
     variables.append(Variable("value", "output", 0.0, ""))
     path = write_fmu(tmp_path / "tank.fmu", "tank", TANK, variables, 2.0)
-    names = {"inputs": ["q"], "outputs": ["T"]}
+    names: Any = {"inputs": ["q"], "outputs": ["T"]}
     plant = example["Plant"](str(path), **names, dt=2.0)
     made, middle = example["controlled"](plant, names, 0.0, 2.0)
     run = made.simulate(plant, steps=60, r=middle + 1, load=0.1)

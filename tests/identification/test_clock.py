@@ -92,7 +92,7 @@ def test_jitter_is_no_gap_and_a_step_back_is_one():
 # What a column of times means
 
 
-def spelled(times: pd.DatetimeIndex, text: str) -> list[Any]:
+def spelled(times: Any, text: str) -> list[Any]:
     """Write times as strftime does, or as differences, or with midnight as 24:00."""
     if text == "pandas":
         return (times - times[0]).astype(str).tolist()

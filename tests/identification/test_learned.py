@@ -97,7 +97,7 @@ def test_a_qpmpc_plans_with_the_model_and_is_saved_with_it(model, tmp_path):
     options: Any = {"stage_weight": [1e-3] * 3, "action_bounds": ([-2.0], [2.0])}
     mpc = QPMPC.of(2, 1, 8, dynamics=model, iterations=40, solver="daqp", gamma=1.0, **options)
     s = torch.tensor([[0.5, 0.0], [1.5, -0.5]]).double()
-    solution = mpc.solve(s)
+    solution: Any = mpc.solve(s)
     assert solution.converged.all()
     x = s
     with torch.no_grad():

@@ -39,7 +39,7 @@ def arm(rows: int, seed: int, sweep: bool) -> dict:
     for w, z, gain in ((0.35, 0.01, 1.0), (0.9, 0.007, 0.5)):
         a = np.exp(-z * w)
         den = [1, -2 * a * np.cos(w), a * a]
-        y[1:] += gain * scipy.signal.lfilter([sum(den)], den, u)
+        y[1:] += gain * np.asarray(scipy.signal.lfilter([sum(den)], den, u))
     return {"y": (y + 2e-3 * rng.normal(size=rows + 1))[:, None], "u": u[:, None]}
 
 

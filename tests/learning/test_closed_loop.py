@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -115,7 +116,7 @@ def test_half_of_the_models_trains_and_the_other_half_decides(found):
     plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=4)
     assert plant.members == plant.unseen.members == 2
     assert not torch.equal(plant._own.A, plant.unseen._own.A)
-    options = {"updates": 2, "loops": 4, "steps": 10, "held_out": 64}
+    options: Any = {"updates": 2, "loops": 4, "steps": 10, "held_out": 64}
     report = qm.improve(mpc, plant, **options)
     assert (report.steps, report.models) == (40, 2)
     assert f"It costs less with {report.gained} of 2 models that did not train it." in str(report)

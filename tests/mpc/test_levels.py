@@ -22,7 +22,7 @@ def drawn(seed: int, horizon: int = N, most: int = 70_000) -> tuple[qm.QPMPC, to
         counts = rng.integers(2, 5, m)
         rules = {name: rng.integers(1, 4, m).tolist() for name in ("min_on", "min_off")}
         sequences = [
-            len(sequences_of(count, *(rules[key][a] for key in ("min_off", "min_on")), horizon))
+            len(sequences_of(count, rules["min_off"][a], rules["min_on"][a], horizon))
             for a, count in enumerate(counts)
         ] if horizon == N else [1]  # fmt: skip
         if np.prod(sequences) <= most:
@@ -109,6 +109,7 @@ def test_action_value_equals_enumeration_on_levels_and_is_infeasible_between_the
     best, _ = enumerated(mpc, s, a.numpy())
     assert mpc.action_value(s, a).item() == pytest.approx(best, rel=1e-6, abs=1e-9)
     assert mpc.action_value(s, mpc.policy(s)).item() == pytest.approx(mpc.value(s).item(), rel=1e-6)
+    assert mpc.levels is not None
     between = torch.from_numpy(mpc.levels.values[:, :2].mean(-1))
     with pytest.raises(qm.SolverError, match="INFEASIBLE"):
         mpc.action_value(s, between)
@@ -227,6 +228,7 @@ def test_compiled_policies_equal_python(seed):
         torch.testing.assert_close(policy(s), mpc.policy(s), rtol=0, atol=1e-8)
     capped = qm.CompiledPolicy(qm.QPMPC.of(**mpc.arguments | {"max_nodes": 20}))
     assert capped.value(s).isfinite().all()
+    assert capped.last is not None
     assert 5 in capped.last.codes
 
 

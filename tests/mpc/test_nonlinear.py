@@ -177,7 +177,8 @@ def test_gradients_equal_finite_differences(case, place):
     }
     of_theta, generator = [*mpc.parameters()], torch.Generator().manual_seed(1)
     for name, function in functions.items():
-        for point in ([s.requires_grad_()], of_theta):
+        points: Any = [s.requires_grad_()], of_theta
+        for point in points:
             change = [torch.randn(x.shape, generator=generator).to(x) for x in point]
             found = torch.autograd.grad(function().sum(), point, allow_unused=True)
             pairs = zip(found, change, strict=True)
@@ -193,7 +194,7 @@ def test_a_saddle_says_that_the_plan_has_no_gradient():
     options: Any = {"stage_weight": [0.0, 1e-3], "action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
     mpc = QPMPC.of(1, 1, 4, dynamics=hilltop, **options)
     s = torch.tensor([[0.0], [0.05]]).double().requires_grad_()
-    solution = mpc.solve(s)
+    solution: Any = mpc.solve(s)
     assert solution.converged.all()
     assert solution.strict.tolist() == [False, True]
     with pytest.warns(RuntimeWarning, match="1 of 2 plans have a gradient of zero"):
@@ -208,7 +209,7 @@ def test_a_saddle_says_that_the_plan_has_no_gradient():
 
 
 def test_a_plan_is_an_argument_and_a_result():
-    mpc = made(iterations=1)
+    mpc: Any = made(iterations=1)
     s = states(mpc, size=1.5)
     with torch.no_grad():
         first = mpc.solve(s)

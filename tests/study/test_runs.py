@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from typing import Any
 
 import pytest
 import torch
@@ -69,7 +70,8 @@ def test_readings_do_not_depend_on_the_gauge(study):
 
 def test_the_radius_is_that_of_the_true_plant_at_the_origin(study):
     run = FinishedRun(study / "small" / "gaussian-free-seed1")
-    A, B, _ = run.physics.true_model()
+    plant: Any = run.physics
+    A, B, _ = plant.true_model()
     with torch.no_grad():
         slope = run.policy.policy(1e-4 * torch.eye(4).to(A)).mT / 1e-4
     radius = torch.linalg.eigvals(A + B @ slope).abs().max().item()
