@@ -44,12 +44,12 @@ def soak(
         return np.where(dropped, np.nan, np.where(absurd, rng.choice(VALUES), signal))
 
     def spoiled(signal: np.ndarray, limits: np.ndarray) -> np.ndarray:
-        """Return rows that now and then have an absurd entry, NaN where no number is absurd."""
+        """Return rows that now and then have an absurd entry, NaN where no number is too large."""
         if not signal.size or rng.random() > ABSURD:
             return signal
         counts["absurd values"] += 1
         signal, (k, i) = signal.copy(), rng.integers(signal.shape)
-        signal[k, i] = rng.choice(VALUES) if np.isfinite(limits[i]) else np.nan
+        signal[k, i] = rng.choice(VALUES) if limits[i] < np.finfo(float).max else np.nan
         return signal
 
     controller.reset(u=u)
