@@ -122,7 +122,8 @@ def make_optimizer(cfg: Config, mpc: QPMPC) -> torch.optim.Optimizer:
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     groups = mpc.parameter_groups(rates)
     if options.name == "adam":
-        return torch.optim.Adam(groups, betas=tuple(options.betas))
+        first, second = options.betas
+        return torch.optim.Adam(groups, betas=(first, second))
     return torch.optim.SGD(groups)
 
 

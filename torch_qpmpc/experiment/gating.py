@@ -44,12 +44,9 @@ class RunGate:
     def __init__(self, cfg: Config, learner: Learner, physics: AnyPlant) -> None:
         self._cfg, self._learner, self._physics = cfg, learner, physics
         self._interval = cfg.gate_interval or cfg.eval_interval
-        options = {
-            "seed": cfg.seed,
-            "pairs": PAIRS,
-            "decisions": math.ceil(cfg.updates / self._interval) + 1,
-        }
-        options |= {"bound": cfg.gate_bound, "patience": PATIENCE if cfg.gate in ACTING else None}
+        options: Any = {"seed": cfg.seed, "pairs": PAIRS, "bound": cfg.gate_bound}
+        options["decisions"] = math.ceil(cfg.updates / self._interval) + 1
+        options["patience"] = PATIENCE if cfg.gate in ACTING else None
         self._gate = Gate(learner.actor, self._costs, **options) if cfg.gate else None
         self.kept: Any = learner.actor if self._gate is None else self._gate.actor
         self.compared = 0

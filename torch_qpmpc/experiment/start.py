@@ -112,6 +112,7 @@ def learning_start(cfg: Config, start: Start | None) -> Start | None:
 def collect_log(cfg: Config, physics: AnyPlant) -> TensorDict:
     """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments."""
     options = cfg.start
+    assert options.name == "data"
     env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
     binary = options.levels == "binary"
     explore = Exploration(physics.lb_a, physics.ub_a, options.hold, binary, cfg.seed)

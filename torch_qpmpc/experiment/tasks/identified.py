@@ -238,8 +238,8 @@ def _cost_of_networks(cfg: Config, start: Start) -> Cost:
     dense = cfg.task.hessian != "diagonal"
     c = _ahead(log, gamma, layout.horizon) if gamma < 1 else 0.0
     terminal = torch.zeros(layout.n_x, dtype=torch.float64)
-    parts = [torch.diag(x) if dense else x for x in (weight, terminal)]
-    return Cost(*parts, cfg.task.hessian, c=c)
+    stage, end = (torch.diag(x) if dense else x for x in (weight, terminal))
+    return Cost(stage, end, cfg.task.hessian, c=c)
 
 
 def _ahead(log: TensorDictBase, gamma: float, k: int) -> Tensor:
