@@ -209,8 +209,8 @@ def certified(p: Programs, *claim: Tensor, compiled: bool = True) -> tuple[Tenso
     left[:, : xi.shape[-1]] += xi
     terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
     if not compiled:
-        arguments = z, lam, chi, *in_torch(p), terms
-        return sample_torch.judge(*arguments)
+        group, fixed, theta, reduced, sizes = in_torch(p)
+        return sample_torch.judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
     arrays = Terms._make(x.contiguous().numpy() for x in terms)
     found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), arrays)
     return (*map(torch.from_numpy, found),)
