@@ -7,7 +7,8 @@ import pytest
 import scipy.linalg
 import torch
 
-from torch_qpmpc.identification import subspace
+from torch_qpmpc.identification import innovations, subspace
+from torch_qpmpc.identification.identification import identify
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.subspace import fit_state_space, held_out_errors, whiteness
@@ -61,7 +62,7 @@ def true_form() -> Innovations:
 
 def test_first_gains_are_those_of_the_textbook_filter():
     form, P = true_form(), np.eye(3)
-    gains = form.gains(200)
+    gains = form.settling(200)[0]
     assert 3 < len(gains) < 200
     for k in range(len(gains) + 3):
         V = C @ P @ C.T + R
@@ -69,6 +70,53 @@ def test_first_gains_are_those_of_the_textbook_filter():
         own = gains[k] if k < len(gains) else form.L
         np.testing.assert_allclose(own, L, atol=1e-8)
         P = A @ (P - L @ V @ L.T) @ A.T + Q
+
+
+def test_the_filter_of_slow_disturbances_is_the_textbooks():
+    """With units far apart, an output that stays and one that the innovations hardly move."""
+    T, size = np.concatenate((C, [[0.0, 1.0, -1.0]])), np.array([1e4, 1e-3, 1.0])
+    form = true_form().transformed(size[:, None] * T, np.linalg.inv(T) / size, np.zeros(3))
+    for model in (form, form._replace(L=form.L * [1.0, 1e-3])):
+        slow, S = model.disturbed(), model.S
+        w = slow.A[:3, 3:]
+        np.testing.assert_array_equal(w[:2], np.eye(2))
+        np.testing.assert_array_equal(slow.A[3:], np.eye(5)[3:] * innovations.DECAY)
+        drift = scipy.linalg.block_diag(
+            np.zeros((3, 3)), innovations.DRIFT**2 * np.diag(np.diag(S))
+        )
+        P = np.zeros((5, 5))  # of the errors of the predictions, whose noise has moved the state
+        N = np.concatenate((model.L, np.zeros((2, 2)))) @ S
+        for _ in range(3000):
+            V = slow.C @ P @ slow.C.T + S
+            gain = np.linalg.solve(V, slow.C @ P + N.T).T
+            after = P + N @ np.linalg.solve(S, N.T) - gain @ V @ gain.T
+            P = slow.A @ after @ slow.A.T + drift
+        units = np.append(size, size[:2])
+        np.testing.assert_allclose(
+            slow.L * size[:2] / units[:, None], gain * size[:2] / units[:, None], atol=1e-6
+        )
+        np.testing.assert_allclose(slow.S, V, rtol=1e-6)
+        assert np.abs(np.linalg.eigvals(slow.A - slow.A @ slow.L @ slow.C)).max() < 0.9999
+    stays = form._replace(A=np.block([[form.A[:1]], [np.eye(3)[1:2]], [form.A[2:]]]))
+    assert len(stays.disturbed().A) == 4
+    assert len(form._replace(S=np.diag([1.0, 0.0])).disturbed().A) == 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_predictions_follow_a_plant_that_drifts_away_from_its_log(seed):
+    """A steady load, which the log has not shown, biases the predictions about half as much."""
+    found = identify([dict(zip("yu", arrays(noisy(1, 600, seed))[0], strict=False))], order=3)
+    one = noisy(1, 400, seed + 10)[0]
+    load = np.zeros((401, 3))
+    for k in range(400):
+        load[k + 1] = A @ load[k] + [0.3, 0.0, 0.3]
+    y, none = one.y.numpy() + load @ C.T, np.zeros((400, 0))
+    off, own = (
+        x.errors(y, one.u.numpy(), none, 20)[150:, -1] for x in (found.fit.model, found.model)
+    )
+    assert abs(np.nanmean(own[:, 0])) < 0.6 * np.nanmean(off[:, 0])
+    assert len(found.model.A) == len(found.fit.model.A) + 2
+    assert found.errors.shape == (600, 20, 2)
 
 
 def test_a_fit_has_the_poles_gain_and_noise_of_the_plant():

@@ -77,7 +77,7 @@ def test_the_report_names_orders_that_the_log_does_not_tell_apart():
 @pytest.mark.parametrize("pieces", [1, 16])
 def test_a_simulation_may_start_anywhere_in_the_range_of_the_log(pieces):
     found = qm.identify([tank(800 // pieces, 60, seed) for seed in range(pieces)], order=2)
-    model, (y, u) = found.model, tank(150, 60, 99, start=25.0).values()
+    model, (y, u) = found.fit.model, tank(150, 60, 99, start=25.0).values()
     inputs = model.inputs(u, np.zeros((len(u), 0)))
     for w in (1, 5, 20, 40):
         rows, right, power, moved = [], [], np.eye(2), np.zeros(2)

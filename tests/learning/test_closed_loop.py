@@ -42,9 +42,9 @@ def logged(loops: int = 8, steps: int = 60) -> Identified:
 
 def controller(found: Identified, **options) -> qm.QPMPC:
     """An MPC that pays for the output, with a wrong weight of its own."""
-    own = {"stage_weight": torch.diag(torch.tensor([1.0, 0.0, 0.01]).double()), "gamma": 1.0}
+    own = {"stage_weight": torch.diag(torch.tensor([1.0, 0.0, 0.0, 0.01]).double()), "gamma": 1.0}
     own |= {"hessian": "block", "action_bounds": ([-0.5], [0.5]), "solver": "daqp"}
-    own |= {"state_bounds": ([-0.2, -np.inf], [np.inf, np.inf]), "structure": "tied"}
+    own |= {"state_bounds": ([-0.2, *[-np.inf] * 2], [np.inf] * 3), "structure": "tied"}
     own |= {"learn": ("H", "H_f", "q", "b", "lb")} | options
     return qm.QPMPC.of(**{**found.arguments, "horizon": 5, **own})
 
@@ -80,7 +80,7 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
 
 def test_an_identified_plant_has_the_moments_of_its_model(found):
     """The first outputs and the later innovations have the model's covariances."""
-    model = found.model
+    model, n = found.model, len(found.model.A)
     plant = simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
     rng, zero = torch.Generator().manual_seed(0), torch.zeros(4000, 1).double()
     s = plant.starts(rng, 4000)
@@ -90,11 +90,11 @@ def test_an_identified_plant_has_the_moments_of_its_model(found):
     torch.testing.assert_close(
         plant.known(s).T.cov(), spread, rtol=0.2, atol=0.05 * spread.max().item()
     )
-    torch.testing.assert_close(s[:, :2], plant.known(s))  # the filter's model is the plant's
+    torch.testing.assert_close(s[:, :n], plant.known(s))  # the filter's model is the plant's
     for _ in range(30):
         before, s = s, plant.step(s, zero, plant.noise(s, plant.draw(rng, 4000)))
-    expected = before[:, :2] @ torch.as_tensor(model.A).T + torch.as_tensor(model.offset)
-    e = (s[:, :2] - expected) @ torch.linalg.pinv(torch.as_tensor(model.L)).T
+    expected = before[:, :n] @ torch.as_tensor(model.A).T + torch.as_tensor(model.offset)
+    e = (s[:, :n] - expected) @ torch.linalg.pinv(torch.as_tensor(model.L)).T
     torch.testing.assert_close(e.T.cov(), torch.as_tensor(model.S)[0, 0], rtol=0.1, atol=0.0)
 
 

@@ -141,7 +141,7 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
     identified = _identified(held_out, design.plant)
     d = torch.cat([one.d for one in held_out.trajectories]).numpy()
     middle, size = _set_points(design, held_out, middle, spread)
-    noise = np.sqrt(np.diag(identified.model.S))
+    noise = np.sqrt(np.diag(identified.fit.model.S))
 
     model = read_model(identified, prices=design.linear.values())
     n, m, n_y, _ = model.sizes

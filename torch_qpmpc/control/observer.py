@@ -154,7 +154,7 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         none = np.zeros((n + n_w, 0))
         first = np.asarray(block_diag(plant.visited[1], loads)) - P
         filtered = Innovations(F, none, none, start, H, L, S, start, first)
-        gains = np.concatenate((filtered.gains(MOST_GAINS, SETTLED), gains))
+        gains = np.concatenate((filtered.settling(MOST_GAINS, SETTLED)[0], gains))
     rest = np.linalg.pinv(np.vstack((F - np.eye(n + n_w), H)), rcond=REST)
     below, own = ((0, n_w), (0, 0)), design.disturbances
     return Observer(

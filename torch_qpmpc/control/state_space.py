@@ -118,8 +118,8 @@ def read_model(
     offset, units, noise, states, means, errors = None, {}, None, None, {}, None
     if isinstance(model, Identified):
         _check_absent("the identification has its own", E=E)
-        A, B, E, offset, C, L, S, *_ = model.model
-        noise, states = (L, S), visited(model.model, model.log.trajectories)
+        A, B, E, offset, C, L, S, *_ = model.fit.model  # a controller has its own disturbances
+        noise, states = (L, S), visited(model.fit.model, model.log.trajectories)
         errors = model.errors.numpy()[:: len(model.errors) // MOST_ERRORS + 1].copy()
         log, dt = model.log, _own_dt(dt, model.log.dt)
         units, signals = dict(log.units), (*log.inputs, *log.known)

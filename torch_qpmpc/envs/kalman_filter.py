@@ -73,7 +73,7 @@ class KalmanFilter(Transform):
         self.memory_key = "filter_covariance" if missing else "filter_step"
         for name in ("A", "B", "E", "offset", "C", "x0", "P0"):
             self.register_buffer(name, torch.as_tensor(getattr(model, name)))
-        gains = np.concatenate((model.gains(STEPS), model.L[None]))
+        gains = np.concatenate((model.settling(STEPS)[0], model.L[None]))
         self.register_buffer("gains", torch.as_tensor(gains))
 
     def gain(self, P: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:

@@ -48,7 +48,8 @@ class Identified:
     seen its part of the data. They are NaN where the filter settles, and after an end.
 
     Attributes:
-        model: the model, whose first states are the filtered outputs.
+        model: the model, whose first states are the filtered outputs. If it has an order, its last
+            states are slow disturbances, which the model of ``fit`` has not.
         log: the trajectories, with the names of their signals.
         horizon: the number of steps of the predictions, N.
         fit: how the model was chosen.
@@ -73,7 +74,8 @@ class Identified:
 
         They are NaN in the first steps of each trajectory, too, in which the filter settles.
         """
-        errors = held_out_errors(self.log.trajectories, self.fit.parts, self.horizon)
+        parts = [part.disturbed() for part in self.fit.parts]
+        errors = held_out_errors(self.log.trajectories, parts, self.horizon)
         return torch.as_tensor(errors)
 
     @property
@@ -88,7 +90,7 @@ class Identified:
         return 1 - (self.rmse / torch.as_tensor(np.nanstd(outputs, 0))).square()
 
     def simulate(self, u: Any, y: Any, d: Any = None) -> Tensor:
-        """Return the outputs of the model alone, without corrections by measurements.
+        """Return the outputs of fit's model alone, without corrections by measurements.
 
         Args:
             u: actions ``(T, n_u)``.
@@ -102,7 +104,8 @@ class Identified:
         Raises:
             QPError: a shape does not match the model.
         """
-        n_d, n_y, n_u = self.model.E.shape[1], len(self.model.C), self.model.B.shape[1]
+        model = self.fit.model
+        n_d, n_y, n_u = model.E.shape[1], len(model.C), model.B.shape[1]
         named = {"u": u, "y": y, "d": np.zeros((len(u), 0)) if d is None else d}
         u, y, d = (np.asarray(ungraded(name, x), dtype=float) for name, x in named.items())
         steps = len(u) if u.ndim else 0
@@ -111,17 +114,17 @@ class Identified:
         for name, (value, shape) in sizes.items():
             if value.shape != shape:
                 raise QPError.expected(name, f"shape {value.shape}", f"{shape}")
-        mean, cov = visited(self.model, self.log.trajectories)
-        model = self.model._replace(x0=mean, P0=ELSEWHERE * cov)
+        mean, cov = visited(model, self.log.trajectories)
+        model = model._replace(x0=mean, P0=ELSEWHERE * cov)
         x, outputs = model.estimates(y, u[: first - 1], d[: first - 1])[-1], [*y]
-        for inputs in self.model.inputs(u, d)[first - 1 :]:
-            x = self.model.A @ x + inputs
-            outputs.append(self.model.C @ x)
+        for inputs in model.inputs(u, d)[first - 1 :]:
+            x = model.A @ x + inputs
+            outputs.append(model.C @ x)
         return torch.as_tensor(np.stack(outputs))
 
     def __str__(self) -> str:
         log, N = self.log, self.horizon
-        poles = ", ".join(f"{abs(pole):.3g}" for pole in self.model.poles)
+        poles = ", ".join(f"{abs(pole):.3g}" for pole in self.fit.model.poles)
         white = ", ".join(f"{share:.0%}" for share in whiteness(self.model, log.trajectories))
         orders = [row.order for row in equal_candidates(self.fit.candidates)]
         equal = ""
@@ -129,7 +132,7 @@ class Identified:
             equal = f"; orders {min(orders)} to {max(orders)} are as good within their error"
         lines = [
             str(log),
-            f"Model of order {len(self.model.A)} with poles of sizes {poles}{equal}",
+            f"Model of order {len(self.fit.model.A)} with poles of sizes {poles}{equal}",
             f"Autocorrelations of the residuals in their 95 % bound: {white}",
         ]
         shares = explained_by_inputs(self.model, log.trajectories)
@@ -170,8 +173,8 @@ def identify(
             "observation")``. Done flags and the ids of trajectories are respected. A list or lazy
             stack of logs may have different lengths.
         horizon: N, the number of steps of the predictions that are reported.
-        order: the number of states; by default errors of held-out predictions choose it. 0: the
-            state is the outputs, measured exactly.
+        order: the number of states but disturbances; by default errors of held-out predictions
+            choose it. 0: the state is the outputs, measured exactly.
         n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
             they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``; all of them by default.
@@ -195,7 +198,7 @@ def identify(
     log = as_log(trajectories, n_x, n_d)
     check_excitation(log)
     fit = fit_state_space(log.trajectories, order)
-    return Identified(fit.model, log, int(horizon), fit)
+    return Identified(fit.model.disturbed(), log, int(horizon), fit)
 
 
 def measured_model(
@@ -233,23 +236,17 @@ def check_excitation(log: Log) -> None:
     u = torch.cat([log.u for log in trajectories])
     if n_u > 1 and ((u == 0) | (u == 1)).all() and (u.sum(-1) == 1).all():
         raise QPError.expected("action", "one-hot vectors of discrete ones", "continuous actions")
-    held = [torch.as_tensor(continued(log.y.numpy())) for log in trajectories]
-    X = torch.cat(
-        [torch.cat((x.d, y[:-1], x.u), -1) for x, y in zip(trajectories, held, strict=True)]
-    )
-    middle = X.mean(0)
-    X = X - middle
-    size = X.square().mean(0).sqrt()
-    X = X / torch.where(size > 0, size, 1.0)
+    X = np.concatenate([np.hstack((x.d, continued(x.y.numpy())[:-1], x.u)) for x in trajectories])
+    middle, size = X.mean(0), X.std(0)
+    X = (X - middle) / np.where(size > 0, size, 1.0)
     for i in range(n_u):
         column = X.shape[1] - n_u + i
-        if size[column] <= STILL * middle[column].abs():
-            got = f"{log.inputs[i]} constant at {middle[column].item():.6g}"
+        if size[column] <= STILL * abs(middle[column]):
+            got = f"{log.inputs[i]} constant at {middle[column]:.6g}"
             raise QPError.expected("action", got, "one that moves", EXCITE)
-        target = X[:, column : column + 1]
-        others = X.index_fill(1, torch.tensor(column), 0.0)
-        rest = target - others @ torch.linalg.lstsq(others, target, driver="gelsd").solution
-        if rest.square().mean().sqrt() <= STILL:
+        target, others = X[:, column], np.delete(X, column, 1)
+        rest = target - others @ np.linalg.lstsq(others, target, rcond=None)[0]
+        if np.sqrt((rest**2).mean()) <= STILL:
             of = "a linear function of the outputs and other actions, as in feedback"
             raise QPError.expected(
                 "action", f"{log.inputs[i]} {of}", "one that moves by itself", EXCITE

@@ -12,6 +12,11 @@ from torch_qpmpc.identification.filter import Array, Course, alike, applied, cou
 SETTLED = 1e-9
 #: A covariance whose entries change by less than this share of the states' variances stays.
 STAYS = 1e-14
+#: A disturbance keeps the share DECAY of itself in a step, and changes by DRIFT of an innovation's
+#: standard deviation. Its filter is steady after SLOW steps.
+DECAY, DRIFT, SLOW = 0.99, 0.01, 2000
+#: Smaller singular values of the gain of the outputs, relative to the largest, are zero.
+WEAK = 1e-3
 
 
 class Innovations(NamedTuple):
@@ -76,10 +81,6 @@ class Innovations(NamedTuple):
         same = np.append(off <= settled * np.abs(self.L * size).max(), True)
         return run.K[: same.argmax()], run.V[: same.argmax()]
 
-    def gains(self, steps: int, settled: float = SETTLED) -> Array:
-        """Return the gains of `settling` ``(steps', n, n_y)``."""
-        return self.settling(steps, settled)[0]
-
     def estimates(self, y: Array, u: Array, d: Array) -> Array:
         r"""Return \xi_0, .., \xi_T ``(*batch, T + 1, n)`` of trajectories of equal length.
 
@@ -116,6 +117,31 @@ class Innovations(NamedTuple):
             x = x[..., : steps - h, :] @ self.A.T + inputs[..., h:, :]
             errors[..., : steps - h, h, :] = y[..., h + 1 :, :] - x @ self.C.T
         return errors
+
+    def disturbed(self) -> Innovations:
+        r"""Return the model with slow disturbances w as further states, and its filter.
+
+        Each output that moves has one, unless all are measured exactly. As innovations do, w adds
+        \xi_{k+1} = A \xi_k + .. + G w_k, so that the filter follows what the log has not shown.
+        C is [I 0].
+        """
+        A, B, E, offset, C, L, S, x0, P0 = self
+        (n, n_y), size = L.shape, np.sqrt(np.diag(S))
+        moves = (A[:n_y] != np.eye(n_y, n)).any(1) & (size > 0)
+        if not moves.any() or np.allclose(L, np.eye(n, n_y), 0.0, SETTLED):
+            return self
+        size, G = size[moves], np.eye(n, n_y)[:, moves]
+        own, hidden = np.split(L[:, moves] * size, [n_y])
+        G[n_y:] = hidden @ np.linalg.pinv(own[moves] / size[:, None], WEAK) / size
+        below = (0, len(size)), (0, 0)
+        F = np.hstack((np.pad(A, below), np.vstack((G, DECAY * np.eye(len(size))))))
+        B, E, L, H = (*(np.pad(x, below) for x in (B, E, L)), np.pad(C, below[::-1]))
+        offset, x0 = (np.pad(x, below[0]) for x in (offset, x0))
+        drift = np.diag(np.append(np.zeros(n), DRIFT * size) ** 2)
+        parts = F, H, L @ S @ L.T, L @ S, drift, S, L, drift, np.ones((SLOW, n_y), bool)
+        run = Course(*course(*map(np.ascontiguousarray, parts), STAYS))
+        P0 = np.pad(P0, below[:1] * 2) + drift / (1 - DECAY**2) - run.after
+        return Innovations(F, B, E, offset, H, run.K[-1], run.V[-1], x0, P0)
 
     def transformed(self, T: Array, inverse: Array, shift: Array) -> Innovations:
         r"""Return the model of the states T \xi + shift; ``inverse @ T`` is the identity."""

@@ -178,10 +178,10 @@ def steady(par: Noisy) -> Innovations:
 def starting(first: Array, every: Array, more: Array | float = 0.0) -> tuple[Array, Array]:
     """Return mean and covariance of the states of a start, and of one more, anywhere in the log.
 
-    ``first`` are the means of the states at G starts, ``more`` the sum of their own covariances. So
-    the further one weighs 1 / (G + 1): a start elsewhere is as unlikely as the log has many.
+    ``first`` are the means of the states at G starts, ``more`` the sum of their own covariances.
+    The further one weighs 2^-G: a start elsewhere is the less likely the more the log has.
     """
-    one = 1 / (len(first) + 1)
+    one = 0.5 ** len(first)
     count = len(first) + one
     mean = (first.sum(0) + one * every.mean(0)) / count
     first, every = first - mean, every - mean

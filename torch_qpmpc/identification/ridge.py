@@ -32,21 +32,12 @@ def ridge(X: Tensor, Y: Tensor, strengths: Tensor = STRENGTHS, share: float = SH
     U, s, Vh = torch.linalg.svd(basis, full_matrices=False)
     a = U.mT @ target
     outside = outside + (target - U @ a).square().sum(0)
-    shrinkage = share * _best_strength(s, a, outside, n, strengths)
-    seen = (s > s.amax() * max(n, m) * torch.finfo(s.dtype).eps).unsqueeze(-1)
-    s = s.unsqueeze(-1)
-    inverse = torch.where(seen, s / (s.square() + n * shrinkage), 0.0)
-    return scale.unsqueeze(-1) * (Vh.mT @ (inverse * a))
-
-
-def _best_strength(s: Tensor, a: Tensor, outside: Tensor, n: int, strengths: Tensor) -> Tensor:
-    """Return the strength of the largest evidence for each target, ``(n_y,)``.
-
-    ``s`` ``(r,)`` are the singular values of n regressors, ``a`` ``(r, n_y)`` the targets in the
-    basis of the left singular vectors, ``outside`` ``(n_y,)`` their squared norms outside of it.
-    """
     gain = 1 + s.square() / (n * strengths.unsqueeze(-1))
     noise = outside + (a.square() / gain.unsqueeze(-1)).sum(1)
     tiny = torch.finfo(s.dtype).tiny
     log_evidence = -n * noise.clamp(min=tiny).log() - gain.log().sum(1).unsqueeze(-1)
-    return strengths[log_evidence.argmax(0)]
+    shrinkage = share * strengths[log_evidence.argmax(0)]
+    seen = (s > s.amax() * max(n, m) * torch.finfo(s.dtype).eps).unsqueeze(-1)
+    s = s.unsqueeze(-1)
+    inverse = torch.where(seen, s / (s.square() + n * shrinkage), 0.0)
+    return scale.unsqueeze(-1) * (Vh.mT @ (inverse * a))

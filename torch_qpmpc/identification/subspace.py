@@ -13,7 +13,7 @@ states. Signals are normalised, so that units decide nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.ridge import ridge
 
 #: Iterations of expectation maximisation, of a candidate and of the fit.
-FEW, MANY = 5, 20
+FEW, MANY = 5, 10
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
@@ -139,7 +139,7 @@ def held_out_errors(
     total = np.full((*block.shape, trajectories[0].y.shape[1]), np.nan)
     for part, model in enumerate(parts):
         mask = (block >= 0) & (block % PARTS == part)
-        total[mask] = np.concatenate([*_errors(model, trajectories, horizon)])[mask]
+        total[mask] = np.concatenate(_errors(model, trajectories, horizon))[mask]
     return total
 
 
@@ -177,7 +177,7 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
-    pairs = zip(*_filtered(model, _signals(trajectories)), strict=True)
+    pairs = _filtered(model, _signals(trajectories))
     x = np.concatenate([(x @ model.A.T + moved)[:-1] for x, moved in pairs])
     return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
 
@@ -186,17 +186,18 @@ def _signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
     return [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
 
 
-def _errors(
-    model: Innovations, trajectories: Sequence[Trajectory], horizon: int
-) -> Iterator[Array]:
+def _errors(model: Innovations, trajectories: Sequence[Trajectory], horizon: int) -> list[Array]:
     """Return multi-step errors ``(T, horizon, n_y)`` of each trajectory."""
-    data, n_u = _signals(trajectories), model.B.shape[1]
-    errors: Any = [None] * len(data)
+    return _each(model, _signals(trajectories), lambda *parts: model.errors(*parts, horizon))
+
+
+def _each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
+    """Return what ``of`` says of each trajectory's y, u and d; it takes those of equal length."""
+    found: list[Any] = [None] * len(data)
     for places, y, v in batches(data):
-        many = model.errors(y, v[..., :n_u], v[..., n_u:], horizon)
-        for i, e in zip(places, many, strict=True):
-            errors[i] = e
-    return errors
+        for i, one in zip(places, of(y, *np.split(v, [model.B.shape[1]], -1)), strict=True):
+            found[i] = one
+    return found
 
 
 # The choice
@@ -234,12 +235,12 @@ class _Held:
 
 def _feasible(starts: Sequence[Sequence[Signals]]) -> tuple[int, ...]:
     """Return the lags whose windows are in at least half of the steps."""
-
-    def usable(data: Sequence[Signals], p: int) -> bool:
-        total, width = sum(len(v) for _, v in data), data[0].y.shape[1] + data[0].v.shape[1]
-        return sum(max(len(v) - p, 0) for _, v in data) >= max(total / 2, 2 * width)
-
-    return tuple(p for p in LAGS if all(usable(data, p) for data in starts))[-3:]
+    found = {*LAGS}
+    for data in starts:
+        steps, width = np.array([len(v) for _, v in data]), sum(x.shape[1] for x in data[0])
+        least = max(steps.sum() / 2, 2 * width)
+        found = {p for p in found if (steps - p).clip(0).sum() >= least}
+    return tuple(sorted(found))[-3:]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of candidates that diverge
@@ -297,7 +298,7 @@ def _sums(
     for part, model in enumerate(models):
         mine = (block >= 0) & (block % PARTS == part)
         k = np.flatnonzero(mine.any(1))
-        x, moved = (np.concatenate(many) for many in _filtered(model, data))
+        x, moved = map(np.concatenate, zip(*_filtered(model, data), strict=True))
         x = x[k]
         for step in range(1, max(HORIZONS) + 1):
             x = x @ model.A.T + moved[np.minimum(k + step - 1, len(y) - 1)]
@@ -313,15 +314,14 @@ def _sums(
     return sums
 
 
-def _filtered(model: Innovations, data: Sequence[Signals]) -> tuple[list[Array], list[Array]]:
+def _filtered(model: Innovations, data: Sequence[Signals]) -> list[tuple[Array, Array]]:
     """Return the estimates and the effects of the inputs ``(T + 1, n)`` of each trajectory."""
-    estimates, moved = ([np.empty(0)] * len(data) for _ in range(2))
-    for places, y, v in batches(data):
-        known = np.split(v, [model.B.shape[1]], -1)
+
+    def both(y: Array, *known: Array) -> Iterator[tuple[Array, Array]]:
         effects = np.pad(model.inputs(*known), ((0, 0), (0, 1), (0, 0)))
-        for i, *own in zip(places, model.estimates(y, *known), effects, strict=True):
-            estimates[i], moved[i] = own
-    return estimates, moved
+        return zip(model.estimates(y, *known), effects, strict=True)
+
+    return _each(model, data, both)
 
 
 def _score(total: Array, count: Array) -> float:

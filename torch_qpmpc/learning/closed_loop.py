@@ -205,7 +205,8 @@ def simulated_plant(
     identified: Identified, cost: Callable, horizon: int, members: int = MEMBERS, seed: int = 0
 ) -> SimulatedPlant:
     """Return the `ensemble` of a model as `crossed` plants, with its filter."""
-    models, log = ensemble(identified, members, seed), identified.log.trajectories
+    log = identified.log.trajectories
+    models = [model.disturbed() for model in ensemble(identified, members, seed)]
     return crossed(models, lambda part: SimulatedPlant(part, models[0], log, cost, horizon))
 
 
@@ -228,9 +229,8 @@ def ensemble(identified: Identified, members: int, seed: int) -> list[Innovation
         pieces = min(members, log[0].steps // (PIECE * (1 + fit.lags)))
         log = [part for (part,) in folds(log, max(pieces, 1))]
     rng, models = np.random.default_rng(seed), [fit.model]
-    for _ in range(members - 1 if len(log) > 1 else 0):
-        again = [log[i] for i in rng.integers(len(log), size=len(log))]
-        models.append(fit_state_space(again, fit.order, fit.lags).model)
+    for rows in rng.integers(len(log), size=((members - 1) * (len(log) > 1), len(log))):
+        models.append(fit_state_space([log[i] for i in rows], fit.order, fit.lags).model)
     return models
 
 
