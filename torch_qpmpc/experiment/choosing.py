@@ -31,11 +31,9 @@ LINEAR, REGULATOR, NONLINEAR = "linear MPC", "linear MPC, regulator's end", "non
 #: The table in a run's folder.
 STARTS = "starts.csv"
 NOTHING = (
-    "No candidate beats zero action, so learning starts from it. Perhaps no scheme of this log "
-    "controls the plant: pass a log about the states where the controller is to work "
-    "(start.file), one of short episodes if the plant is unstable (task.episode_steps=20), the "
-    "plant's own cost (task.stage_weight), or a theta from a network: 'Scheduled and nonlinear "
-    "plants' in the guides."
+    "No candidate beats zero action, so learning starts from it. Pass a log about the states where "
+    "the controller is to work (start.file), one of short episodes if the plant is unstable "
+    "(task.episode_steps=20), or the plant's own cost (task.stage_weight)."
 )
 
 

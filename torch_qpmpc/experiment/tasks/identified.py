@@ -220,31 +220,27 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
 def _observed_cost(cfg: Config, start: Start) -> Cost:
     """Return the cost of a scheme from the start's; the constant has the log's mean after x_N."""
     gamma, layout, log = cfg.task.gamma, start.layout, start.log
-    diagonal = cfg.task.hessian == "diagonal"
-    fitted = start.cost or fit_rewards(log, layout, diagonal, start.model)
-    cost = scheme_cost(fitted, layout, gamma, cfg.task.hessian)
-    if gamma < 1:
-        cost = replace(cost, c=cost.c + _ahead(log, gamma, layout.horizon + 1))
-    return cost
+    assert start.cost is not None
+    cost = scheme_cost(start.cost, layout, gamma, cfg.task.hessian)
+    return replace(cost, c=cost.c + _ahead(log, gamma, layout.horizon + 1))
 
 
 def _cost_of_networks(cfg: Config, start: Start) -> Cost:
     """Return theta's cost beside that of the dynamics: next to none."""
     gamma, layout, log = cfg.task.gamma, start.layout, start.log
-    weight = torch.zeros(layout.n, dtype=torch.float64)
-    kept = valid_steps(log)
+    kept, weight = valid_steps(log), torch.zeros(layout.n, dtype=torch.float64)
     size = log["action"][kept].double().square().mean(0)
     weight[layout.n_x :] = TINY * _rewards(log)[kept].abs().mean() / size
+    weights = weight, torch.zeros_like(weight[: layout.n_x])
     dense = cfg.task.hessian != "diagonal"
-    c = _ahead(log, gamma, layout.horizon) if gamma < 1 else 0.0
-    terminal = torch.zeros(layout.n_x, dtype=torch.float64)
-    stage, end = (torch.diag(x) if dense else x for x in (weight, terminal))
-    return Cost(stage, end, cfg.task.hessian, c=c)
+    stage, end = (torch.diag(x) if dense else x for x in weights)
+    return Cost(stage, end, cfg.task.hessian, c=_ahead(log, gamma, layout.horizon))
 
 
 def _ahead(log: TensorDictBase, gamma: float, k: int) -> Tensor:
-    """Return the discounted costs from stage k on, each the mean of the log's."""
-    return -(gamma**k) / (1 - gamma) * _rewards(log)[valid_steps(log)].mean()
+    """Return the discounted costs from stage k on, each the mean of the log's; 0 if endless."""
+    mean = -_rewards(log)[valid_steps(log)].mean()
+    return gamma**k / (1 - gamma) * mean if gamma < 1 else 0 * mean
 
 
 def _rewards(log: TensorDictBase) -> Tensor:
