@@ -126,6 +126,7 @@ def summary_figure(
     panels: Any = figure.subfigures(1, 3)
     left, middle, right = (panel.subplots() for panel in panels)
     draw_learning(left, updates, J, evaluation)
-    draw_matrix(middle, mpc.C, mpc, r"Learned constraint matrix $C_\theta$")
+    title = "Learned constraint matrix" if mpc.sequential is None else "Unused by networks:"
+    draw_matrix(middle, mpc.C, mpc, rf"{title} $C_\theta$")
     draw_positions(right, evaluation.loops, mpc, episode_names(mpc, evaluation))
     return figure
