@@ -114,13 +114,16 @@ def test_the_candidates_have_the_stage_s_and_the_regulator_s_cost(monkeypatch):
     named = candidates(cfg, physics, log)
     assert [*named] == [LINEAR, REGULATOR], "no network predicts a linear plant"
     mpcs = {name: make_mpc(cfg, start.plant(physics), start) for name, start in named.items()}
-    start, mpc = named[LINEAR], mpcs[LINEAR]
+    outputs, mpc = named[LINEAR], mpcs[LINEAR]
+    assert outputs.order == 0
+    assert outputs.cost is not None
+    assert_close(mpc.H_f.double(), outputs.cost.W[: mpc.n_x, : mpc.n_x], rtol=1e-6, atol=1e-6)
+    start, mpc = named[REGULATOR], mpcs[REGULATOR]
     assert start.order > 1
     assert start.cost is not None
-    assert_close(mpc.H_f.double(), start.cost.W[: mpc.n_x, : mpc.n_x], rtol=1e-6, atol=1e-6)
     A, B = (torch.tensor(part) for part in start.model[:2])
     P = terminal_riccati(A, B, start.cost.W, mpc.gamma, mpc.layout)
-    assert_close(mpcs[REGULATOR].H_f.double(), P, rtol=1e-6, atol=1e-6)
+    assert_close(mpc.H_f.double(), P, rtol=1e-6, atol=1e-6)
     diagonal = make_config(*DATA, "task.hessian=diagonal")
     assert [*candidates(diagonal, physics, log)] == [LINEAR]
 

@@ -88,7 +88,10 @@ class Choice(NamedTuple):
 
 
 def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
-    """Return the starts of a log by name: linear MPC, with each cost of x_N, and nonlinear MPC."""
+    """Return the starts of a log by name: linear MPC, with each cost of x_N, and nonlinear MPC.
+
+    Beside the regulator's on an estimate with hidden states, the stage's is on the outputs.
+    """
     start = identified_start(cfg, physics, log)
     named = {LINEAR: start}
     if start.cost is not None and cfg.task.hessian != "diagonal":
@@ -96,6 +99,8 @@ def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
             regulated = start._replace(riccati=True)
             make_mpc(cfg, start.plant(physics), regulated)
             named[REGULATOR] = regulated
+            if start.order:
+                named[LINEAR] = identified_start(cfg, physics, log, order=0)
     if (nonlinear := nonlinear_start(cfg, physics, log)) is not None:
         named[NONLINEAR] = nonlinear
     return named
