@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 import torch_qpmpc as qm
 from tests.control.controllers import exported
 from torch_qpmpc import QPError
+from torch_qpmpc.control.simulation import Run
 
 A, B = np.diag([0.9, 0.7]), np.array([[0.3, 0.1], [-0.1, 0.4]])
 MODEL = A, B, np.eye(2)
@@ -55,7 +56,7 @@ def planned(x: np.ndarray, r: np.ndarray, constraints: Any, ends: Any) -> np.nda
     G, h, prices = map(np.array, zip(*((g, b, w) for g, b, w in limits if b < np.inf), strict=True))
     soft, n = np.isfinite(prices), 2 * N
     G = np.block([[G, -np.eye(len(G))[:, soft]], [np.zeros((soft.sum(), n)), -np.eye(soft.sum())]])
-    H = block_diag(2 * H, 1e-9 * np.eye(soft.sum()))
+    H: Any = block_diag(2 * H, 1e-9 * np.eye(soft.sum()))
     h, q = np.append(h, np.zeros(soft.sum())), np.append(2 * q, prices[soft])
     side = np.append(np.ones(n), np.full(soft.sum(), 1e3))
     z = qpsolvers.solve_qp(H, q, G, h, lb=-side, ub=side, solver="quadprog")
@@ -88,7 +89,7 @@ def test_outputs_settle_at_the_steady_state_that_they_leave_nearest_to_the_set_p
     (_, of_u, (_, top), _), (y_m, u_m, (_, high), price) = map(
         rows_of, (*HARD.values(), *SOFT.values())
     )
-    P = block_diag(2 * gain.T @ Q @ gain, 1e-10)
+    P: Any = block_diag(2 * gain.T @ Q @ gain, 1e-10)
     q = np.append(2 * gain.T @ Q @ (gain @ load - r), price)
     G = np.vstack((np.append(of_u, 0), np.append(y_m @ gain + u_m, -1)))
     h, side = np.array([top, high - y_m @ gain @ load]), np.array([1.0, 1.0, 1e3])
@@ -134,7 +135,7 @@ def test_they_are_saved_explained_and_paid_for(tmp_path):
     run = controller.simulate(steps=20, r=[3.0, 0.0], load=[0.3, 0.0])
     plain = made(8, y_bounds={"p": (-1.5, 1.5)}, du_bounds=(-0.8, 0.8)).mpc.design
     over = np.maximum(run.y[:-1, 0] - 0.5 * run.u[:, 1] - 0.6, 0)
-    own = qm.control.simulation.Run(plain, run.y, run.r, run.u, run.known, run.u_s, run.u_last)
+    own = Run(plain, run.y, run.r, run.u, run.known, run.u_s, run.u_last)
     assert over.max() > 0.1
     assert np.allclose(run.cost, own.cost + 0.3 * over)
     controller.redesign(constraints={"mixed": None}, terminal_constraints={"end": None})

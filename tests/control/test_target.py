@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import qpsolvers
@@ -86,7 +88,10 @@ def test_zones_hold_the_outputs_that_free_inputs_move(seed):
     # The entries are u and the zones' violations.
     rows = np.block([[gain[1:], -np.eye(2)], [-gain[1:], -np.eye(2)]])
     P = np.pad(2 * gain.T @ Q @ gain, (0, 2)) + 1e-9 * np.eye(5)
-    limits = {"lb": np.append(-np.ones(3), [0.0, 0.0]), "ub": np.append(np.ones(3), [9e9, 9e9])}
+    limits: Any = {
+        "lb": np.append(-np.ones(3), [0.0, 0.0]),
+        "ub": np.append(np.ones(3), [9e9, 9e9]),
+    }
     for size in (0.3, 1.0, 4.0):
         r = size * rng.normal(size=3)
         q = np.append(-2 * gain.T @ Q @ r, [price, price])

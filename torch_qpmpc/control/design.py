@@ -56,7 +56,7 @@ class Bands(NamedTuple):
     upper: Array
     price: Array
 
-    def take(self, places: Array) -> Bands:
+    def take(self, places: Any) -> Bands:
         """Return some of the rows."""
         return Bands(*(part[places] for part in self))
 
@@ -293,7 +293,8 @@ class Design:
     @cached_property
     def inner(self) -> Array:
         """Mask of the `bands` of outputs alone."""
-        return self.bands.W[:, : len(self.Q)].any(1) & ~self.bands.W[:, len(self.Q) :].any(1)
+        of_y, of_u = np.split(np.abs(self.bands.W), [len(self.Q)], axis=1)
+        return (of_y.sum(1) > 0) & (of_u.sum(1) == 0)
 
     def combined(self, argument: str) -> Bands:
         """Return the rows of combinations of signals; without outputs they are hard by default."""
@@ -305,7 +306,7 @@ class Design:
         price = np.where(np.isnan(price), default, price)
         parts = np.full(len(own), argument), np.array([*own], str), W
         none = (np.zeros((len(own), len(x))) for x in (self.plant.inputs, self.plant.known))
-        return Bands(*parts, *none, *np.reshape(bounds, (-1, 2)).T, price)
+        return Bands._make((*parts, *none, *np.reshape(bounds, (-1, 2)).T, price))
 
     @cached_property
     def bounded(self) -> tuple[Array, Array]:
@@ -462,7 +463,7 @@ class Design:
     @cached_property
     def acts(self) -> Array:
         """Mask of the known signals that act on the plant, ``(n_d,)``."""
-        return self.plant.E.any(0)
+        return np.asarray(self.plant.E.any(0))
 
     @cached_property
     def weighted(self) -> Array:

@@ -352,7 +352,7 @@ def _pulls(mpc: LinearMPC) -> dict[str, Array]:
 def _moves(mpc: LinearMPC, dtype: str) -> Array:
     """Return the plan's bounds of the first move, ``(2, m)``, with room for rounding."""
     design, bands, qp = mpc.design, mpc.design.bands, mpc.plan.quadratic_program()
-    bounds, own = np.outer([-np.inf, np.inf], np.ones(len(design.R))), bands.D.any(1)
+    bounds, own = np.outer([-np.inf, np.inf], np.ones(len(design.R))), np.asarray(bands.D.any(1))
     first = len(qp.lb) - len(design.ends.W) - mpc.horizon * len(own)
     sides = (side[first:][: len(own)].detach().double().cpu().numpy() for side in (qp.lb, qp.ub))
     bounds[:, np.nonzero(bands.D)[1]] = [side[own] for side in sides]

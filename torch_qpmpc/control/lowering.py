@@ -255,7 +255,7 @@ def target_mpc(design: Design) -> QPMPC:
     error[:, :n_r] = 0.0
     K, bands = np.eye(n_d, error.shape[1], n_x - 1 - n_d), design.bands
     D, of_y = bands.W @ np.vstack((error, inputs)) - bands.K @ K, bands.W[:, :n_y].any(1)
-    moved = D[:, n_x:].any(-1)
+    moved = np.asarray(D[:, n_x:].any(-1))
     order = np.argsort(design.inner, kind="stable")
     order = order[moved[order]]
     units = np.where(of_y, 1.0, bands.sizes(sizes.y, sizes.u))
