@@ -299,9 +299,8 @@ class Design:
     def combined(self, argument: str) -> Bands:
         """Return the rows of combinations of signals; without outputs they are hard by default."""
         own, names = getattr(self, argument), (*self.plant.outputs, *self.plant.inputs)
-        W = [[weights.get(x, 0.0) for x in names] for weights, *_ in own.values()]
-        W, bounds = np.reshape(W, (-1, len(names))), [pair for _, pair, _ in own.values()]
-        price = np.array([price for *_, price in own.values()])
+        W, bounds, price = zip(*own.values(), strict=True) if own else ((), (), ())
+        W = np.reshape([[row.get(x, 0.0) for x in names] for row in W], (-1, len(names)))
         default = np.where(W[:, : len(self.Q)].any(1), self.prices(W), np.inf)
         price = np.where(np.isnan(price), default, price)
         parts = np.full(len(own), argument), np.array([*own], str), W
