@@ -8,17 +8,14 @@ bounds, and nothing else of the plant:
 - ``moved``: the same, aimed beyond the set-point by as much as pays for the closed loop's noise.
 - ``Riccati``: the regulator for the mean and the noise that were identified, with noise that grows
   (de Koning, Automatica 1982), clipped to the bounds.
-- ``scenario``: MPC against 32 courses of prediction errors, drawn from the log.
 - ``two numbers``: ``mean`` with the set-point and the input's weight of least cost in simulated
   loops of the identified, noisy models.
 - ``improve``: theta by gradients through the same loops, from ``mean``.
 - ``Q-learning``: half of the transitions are its log, and it collects the others.
-- ``both``: ``improve`` after ``Q-learning``, with its log.
 
-``scenario`` and ``both`` have five seeds, and ``Q-learning`` from 20,000 transitions has four: they
-take long. J is the mean cost of a step in 2,000 loops (scenario: 200) of 50 steps of the plant,
-drawn for each seed. Finished rows are kept in docs/results/rivals.csv; table and figure go into
-docs/results/improvement.md.
+``Q-learning`` from 20,000 transitions has four seeds: it takes long. J is the mean cost of a step
+in 2,000 loops of 50 steps of the plant, drawn for each seed. Finished rows are kept in
+docs/results/rivals.csv; table and figure go into docs/results/improvement.md.
 """
 
 from __future__ import annotations
@@ -259,49 +256,6 @@ def _growth(found: Identified) -> np.ndarray:
     return growth(e, np.hstack((x, np.concatenate([one.u for one in log]))))[0]
 
 
-class Scenarios:
-    """MPC whose actions cost least in the mean over 32 courses of the log's prediction errors."""
-
-    def __init__(self, plant: Priced, found: Identified, seed: int) -> None:
-        A, B, _, offset, C, *_ = found.model
-        powers = [np.eye(len(A))]
-        for _ in range(HORIZON):
-            powers.append(A @ powers[-1])
-        self.free = torch.tensor(np.vstack([C @ F for F in powers[1:]]))
-        pulse = [(C @ F @ B)[0, 0] for F in powers[:-1]]
-        self.of = torch.tensor(scipy.linalg.toeplitz(pulse, np.zeros(HORIZON)))
-        self.constant = torch.tensor(np.cumsum([(C @ F @ offset)[0] for F in powers[:-1]]))
-        parts = ([x.numpy() for x in one] for one in found.log.trajectories)
-        errors = np.concatenate([found.model.errors(y, u, d, HORIZON)[..., 0] for y, u, d in parts])
-        self.errors = torch.tensor(errors[np.isfinite(errors).all(1)])
-        self.plant, self.rng, self.u = plant, torch.Generator().manual_seed(seed), None
-
-    def loss(self, u: Tensor, y: Tensor, e: Tensor) -> Tensor:
-        """Return the mean cost of actions ``(count, N)``."""
-        y = y + u @ self.of.mT
-        costs = self.plant.price((y[:, None] + e)[..., None], u[:, None, :, None])
-        return costs.sum(-1).mean(1)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        low, high = self.plant.lb_a, self.plant.ub_a
-        drawn = torch.randint(len(self.errors), (len(x), 32), generator=self.rng)
-        y, e = x @ self.free.mT + self.constant, self.errors[drawn]
-        if self.u is None or len(self.u) != len(x):
-            self.u = ((low + high) / 2).expand(len(x), HORIZON)
-        with torch.enable_grad():
-            u = torch.cat((self.u[:, 1:], self.u[:, -1:]), 1).clone().requires_grad_()
-            adam = torch.optim.Adam([u], lr=float(high - low) / 20)
-            schedule = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 0.01, 100)
-            for _ in range(100):
-                adam.zero_grad()
-                self.loss(u, y, e).sum().backward()
-                adam.step()
-                schedule.step()
-                u.data.clamp_(low, high)
-        self.u = u.detach()
-        return self.u[:, :1]
-
-
 def tuned(plant: Priced, found: Identified, simulated: Any, std: float, seed: int) -> qm.QPMPC:
     """Return MPC with the set-point and the input's weight of least cost in simulated loops."""
 
@@ -365,11 +319,11 @@ def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
     def price(p: Tensor, u: Tensor) -> Tensor:
         return plant.price(p, u)
 
-    def row(design: str, policy: Callable, model: Any = found.model, loops: int = LOOPS) -> Any:
+    def row(design: str, policy: Callable, model: Any = found.model) -> Any:
         nonlocal began
         seconds = time.process_time() - began
         seen = plant.observed(model)
-        loop = plant_loop(policy, seen, steps=STEPS, starts=loops, seed=EVALUATION + seed)
+        loop = plant_loop(policy, seen, steps=STEPS, starts=LOOPS, seed=EVALUATION + seed)
         names = {"plant": name, "transitions": size, "seed": seed, "design": design}
         began = time.process_time()
         return names | {"J": loop.costs.mean().item(), "seconds": round(seconds, 1)}
@@ -382,16 +336,11 @@ def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
     yield row("moved", designed(plant, found, moved).policy)
     models = simulated_plant(found, price, HORIZON, seed=seed)
     yield row("two numbers", tuned(plant, found, models, known.std, seed).policy)
-    if size == 2000 and seed in SEEDS[:5]:
-        yield row("scenario", Scenarios(plant, found, seed), loops=200)
     qm.improve(mpc, found, cost=price, updates=60, steps=STEPS, seed=seed)
     yield row("improve", mpc.policy)
     if size <= 10_000 or seed in SEEDS[:4]:
         mpc, found = q_learning(name, size, seed)
         yield row("Q-learning", mpc.policy, found.model)
-    if size == 2000 and seed in SEEDS[:5]:
-        qm.improve(mpc, found, cost=price, updates=60, steps=STEPS, seed=seed)
-        yield row("both", mpc.policy, found.model)
 
 
 def shown(rows: Any) -> str:
