@@ -188,7 +188,7 @@ def _signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
 
 def _errors(model: Innovations, trajectories: Sequence[Trajectory], horizon: int) -> list[Array]:
     """Return multi-step errors ``(T, horizon, n_y)`` of each trajectory."""
-    return _each(model, _signals(trajectories), lambda *parts: model.errors(*parts, horizon))
+    return _each(model, _signals(trajectories), lambda y, u, d: model.errors(y, u, d, horizon))
 
 
 def _each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
