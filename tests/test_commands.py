@@ -64,7 +64,6 @@ CANNOT = {
     "python -m tests.benchmarks.table": "a benchmark of minutes that cannot be shortened",
     "python -m tests.benchmarks.one_state --write": "the same, with osqp, clarabel and casadi",
     "python -m tests.benchmarks.solvers --write": "the same, with piqp, osqp, qpax and more",
-    "python -m tests.benchmarks.export --write": "the same, with osqp",
     "python -m tests.benchmarks.gpu --write": "it needs a GPU",
     "python -m tests.benchmarks.public_logs FOLDER --write": "its logs are downloaded by hand",
     "python train.py -m +study=paper hydra/launcher=submitit_slurm "
@@ -123,6 +122,10 @@ SHORT = {
         "--cases Gros-Zanon --seeds 71"
     ),
     "python -m tests.benchmarks.violation": Short("--seeds 1 --steps 50"),
+    "python -m tests.benchmarks.micro_controller --write": Short(
+        "--seeds 71 --designs 'N = 40' 'N = 3, a lower price'"
+    ),
+    "python -m tests.benchmarks.export --write": Short("--problem 'point mass, N = 10'"),
     "python -m tests.benchmarks.improvement": Short(
         "--cases 'Point mass, Brownian noise' --seeds 71"
     ),

@@ -1,17 +1,15 @@
-"""One step of the exported C beside ``mpc.policy`` and OSQP's generated code.
+"""One step of the exported C beside ``mpc.policy``.
 
     python -m tests.benchmarks.export --write
 
 Warm is a closed loop of 32 starts with 50 steps, cold random states without a warm start. A step's
-time is its median over several passes, in which the contenders take turns. OSQP is measured if
-``pip install osqp`` is there: its code solves the QP with z and split slacks, to its default, 1e-3.
+time is its median over several passes, in which the contenders take turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
-import importlib.util
 import subprocess
 import sys
 import tempfile
@@ -37,8 +35,8 @@ CHOSEN = (
     "12 states, 4 actions, N = 10",
 )
 PASSES, COLD = 5, 1000
-#: Steps of the contenders in Python, and of OSQP.
-FEW, FEWER = 200, 25
+#: Steps of the contender in Python.
+FEW = 200
 
 
 class Times(NamedTuple):
@@ -84,50 +82,6 @@ def compiled(mpc: QPMPC, folder: Path) -> Callable[[np.ndarray, bool], Times]:
     return run
 
 
-def osqp(mpc: QPMPC, folder: Path) -> Callable[[np.ndarray, bool], Times]:
-    """Return a function that times OSQP's generated code, which starts from its last solution."""
-    import osqp as package  # pyright: ignore[reportMissingImports] - optional
-    from scipy import sparse
-
-    data = (x.detach().numpy() for x in mpc.quadratic_program().tensors())
-    H, q, _, C, b, G, lb, ub, w = data
-    n, n_p, soft = len(q), mpc.n_p, np.flatnonzero(np.isfinite(w) & (w > 0))
-    r, m = len(soft), len(lb)
-    used = (np.isfinite(lb) | np.isfinite(ub)) & (w > 0)
-    T = np.zeros((m, r))
-    T[soft, np.arange(r)] = 1
-    P = sparse.block_diag((H, sparse.csc_matrix((2 * r, 2 * r)))).tocsc()
-    A = sparse.vstack(
-        [
-            sparse.hstack([sparse.eye(n_p, n), sparse.csc_matrix((n_p, 2 * r))]),
-            sparse.hstack([sparse.csc_matrix(C), sparse.csc_matrix((len(C), 2 * r))]),
-            sparse.csc_matrix(np.hstack([G, -T, T])[used]),
-            sparse.hstack([sparse.csc_matrix((2 * r, n)), sparse.eye(2 * r)]),
-        ]
-    ).tocsc()
-    lower = np.concatenate((np.zeros(n_p), b, lb[used], np.zeros(2 * r)))
-    upper = np.concatenate((np.zeros(n_p), b, ub[used], np.full(2 * r, np.inf)))
-    solver = package.OSQP()
-    cost = np.concatenate((q, w[soft], w[soft]))
-    options = {"max_iter": 4000, "verbose": False}
-    options |= {"adaptive_rho": True, "adaptive_rho_interval": 50}
-    solver.setup(sparse.triu(P).tocsc(), cost, A, lower, upper, **options)
-    solver.codegen(str(folder), parameters="matrices", force_rewrite=True, compile=False)
-    sources = [str(x) for x in (folder / "src").glob("*.c")] + [str(folder / "workspace.c")]
-    includes = [f"-I{folder}/inc/public", f"-I{folder}/inc/private", "-DOSQP_EMBEDDED_MODE=2"]
-    timed = library(folder, HERE / "timing_osqp.c", *sources, *includes, "-lm")
-
-    def run(p: np.ndarray, cold: bool) -> Times:
-        p, times, u = np.ascontiguousarray(p), np.empty(len(p)), np.empty((len(p), mpc.n_u))
-        bounds = lower.clip(-1e30), upper.clip(max=1e30)  # OSQP's infinity
-        sizes = [ctypes.c_long(x) for x in (len(p), n_p, mpc.n_u)]
-        arrays = [pointer(x) for x in (p, *bounds, u, times)]
-        timed.osqp_timed(*arrays, *sizes, ctypes.c_int(cold))
-        return Times(times / 1e3, u)
-
-    return run
-
-
 def in_python(mpc: QPMPC) -> Callable[[np.ndarray, bool], Times]:
     """Return a function that times ``mpc.policy``, which has no warm start."""
 
@@ -151,19 +105,14 @@ def measured(name: str) -> list[list[str]]:
     warm = states.reshape(-1, mpc.n_p).numpy()
     cold = known(np.random.default_rng(2), COLD)
     with tempfile.TemporaryDirectory() as temporary:
-        ours, theirs = Path(temporary) / "ours", Path(temporary) / "osqp"
-        ours.mkdir()
-        theirs.mkdir()
         contenders: dict[str, Any] = {
-            "C": compiled(mpc, ours),
+            "C": compiled(mpc, Path(temporary)),
             "mpc.policy, daqp": in_python(mpc),
         }
-        if importlib.util.find_spec("osqp"):
-            contenders["OSQP's generated C, 1e-03"] = osqp(mpc, theirs)
         times: dict[str, list[list[Times]]] = {who: [] for who in contenders}
         for _ in range(PASSES):
             for who, run in contenders.items():
-                few = None if who == "C" else FEWER if "OSQP" in who else FEW
+                few = None if who == "C" else FEW
                 times[who].append([run(warm[:few], False), run(cold[:few], True)])
     rows = []
     for who, passes in times.items():
@@ -187,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for name in [options.problem] if options.problem else CHOSEN:
         rows += measured(name)
-        print("\n".join(" | ".join(row) for row in rows[-3:]), flush=True)
+        print("\n".join(" | ".join(row) for row in rows[-2:]), flush=True)
     if options.write:
         lines = [titles, ["---", "---", *["---:"] * 3], *rows]
         table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)

@@ -5,7 +5,7 @@ a step; kicks are rare, and the positions of the outer masses should stay within
 seed draws masses, springs and dampers. The state and the model are known, and every design that is
 tuned or trained uses the simulator of the true plant:
 
-- ``N = 40``: what sees as far as matters.
+- ``N = 40``: what sees as far as matters, and plans without kicks.
 - ``N = 3``: the cost of x_N is the regulator's; also with a twentieth of the price of a bound, as
   three steps ahead most violations come too late to be avoided.
 - ``regulator``: its gain, clipped to the limits.
@@ -251,7 +251,7 @@ def on_a_controller(design: Any, plant: Masses, seed: int) -> str:
         try:
             run = compiled(design, Path(folder))
         except qm.QPError:
-            return "refused: its cost is ill-conditioned"
+            return "refused"
         loop = closed_loop(design.policy, plant, steps=400, starts=16, seed=seed)
         p = loop.states[:-1].transpose(0, 1).reshape(-1, 8).numpy()
         slowest = np.min([run(p, False).steps for _ in range(5)], 0).max()
@@ -286,6 +286,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     ratios, rows = measured(options.seeds, options.designs), []
+    del ratios["N = 40"]
     for name, own in ratios.items():
         plant, seed = masses(options.seeds[0]), options.seeds[0]
         numbers = f"{np.median(own):.3f}", f"{min(own):.3f} to {max(own):.3f}"
