@@ -296,10 +296,10 @@ for _make in (make_dosing, make_balance):
     )
 
 
-def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Identified]:
+def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Any]:
     """Return what train.py learns from half the transitions as its log and the others, one by one.
 
-    Its log's model is that of the filter.
+    The model of its log is that of the filter.
     """
     half = transitions // 2
     options = {"seed": seed, "start.transitions": half, "updates": half // 40 - 1}
@@ -308,7 +308,7 @@ def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Identi
     with tempfile.TemporaryDirectory() as folder:
         train.train(cfg, folder, quiet=True)
         log = stored_log(Path(folder) / LOG)
-        return qm.load_run(folder).policy, qm.identify(log, HORIZON)
+        return qm.load_run(folder).policy, qm.identify(log, HORIZON).fit.model
 
 
 def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
@@ -339,8 +339,8 @@ def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
     qm.improve(mpc, found, cost=price, updates=60, steps=STEPS, seed=seed)
     yield row("improve", mpc.policy)
     if size <= 10_000 or seed in SEEDS[:4]:
-        mpc, found = q_learning(name, size, seed)
-        yield row("Q-learning", mpc.policy, found.model)
+        mpc, model = q_learning(name, size, seed)
+        yield row("Q-learning", mpc.policy, model)
 
 
 def shown(rows: Any) -> str:
