@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -96,6 +97,7 @@ def he2(seed: int) -> Case:
         return evaluate(cfg, warm_policy(mpc), plant).costs.sum(0).mean().item()
 
     found = qm.identify(log, 10, order=start.order)
+    found = replace(found, model=found.fit.model)  # whose state the start's MPC has
     return Case(J, partial(qm.improve, mpc, found, updates=40), log.numel())
 
 

@@ -78,6 +78,15 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
         torch.testing.assert_close((leaf.grad * direction).sum(), expected, rtol=1e-4, atol=1e-7)
 
 
+def test_the_policy_sees_the_state_of_the_identified_model(found):
+    plain = dataclasses.replace(found, model=found.fit.model)
+    assert len(plain.model.A) < len(found.model.A)
+    for one in (found, plain):
+        plant = simulated_plant(one, lambda p, u: p.sum(-1), 5, members=2)
+        seen = plant.known(plant.starts(torch.Generator().manual_seed(0), 4))
+        assert seen.shape == (4, len(one.model.A))
+
+
 def test_an_identified_plant_has_the_moments_of_its_model(found):
     """The first outputs and the later innovations have the model's covariances."""
     model, n = found.model, len(found.model.A)

@@ -205,8 +205,8 @@ def simulated_plant(
     identified: Identified, cost: Callable, horizon: int, members: int = MEMBERS, seed: int = 0
 ) -> SimulatedPlant:
     """Return the `ensemble` of a model as `crossed` plants, with its filter."""
-    log = identified.log.trajectories
-    models = [model.disturbed() for model in ensemble(identified, members, seed)]
+    log, slow = identified.log.trajectories, len(identified.model.A) > len(identified.fit.model.A)
+    models = [x.disturbed() if slow else x for x in ensemble(identified, members, seed)]
     return crossed(models, lambda part: SimulatedPlant(part, models[0], log, cost, horizon))
 
 
