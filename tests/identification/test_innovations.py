@@ -81,9 +81,8 @@ def test_the_filter_of_slow_disturbances_is_the_textbooks():
         w = slow.A[:3, 3:]
         np.testing.assert_array_equal(w[:2], np.eye(2))
         np.testing.assert_array_equal(slow.A[3:], np.eye(5)[3:] * innovations.DECAY)
-        drift = scipy.linalg.block_diag(
-            np.zeros((3, 3)), innovations.DRIFT**2 * np.diag(np.diag(S))
-        )
+        drift = np.zeros((5, 5))
+        drift[3:, 3:] = innovations.DRIFT**2 * np.diag(np.diag(S))
         P = np.zeros((5, 5))  # of the errors of the predictions, whose noise has moved the state
         N = np.concatenate((model.L, np.zeros((2, 2)))) @ S
         for _ in range(3000):
