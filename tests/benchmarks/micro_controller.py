@@ -187,7 +187,7 @@ def kernel(x: np.ndarray, y: np.ndarray, length: float) -> np.ndarray:
     return (1 + r + r**2 / 3) * np.exp(-r)
 
 
-def network(plant: Masses, seed: int) -> nn.Module:
+def network(plant: Masses, seed: int) -> Callable[[Tensor], Tensor]:
     """Return a network that imitates N = 40 on 1,000 loops of its own, of 64 steps."""
     torch.manual_seed(seed)
     with torch.no_grad():
@@ -204,18 +204,7 @@ def network(plant: Masses, seed: int) -> nn.Module:
         loss.backward()
         optimizer.step()
         schedule.step()
-    return Scaled(net, size)
-
-
-class Scaled(nn.Module):
-    """A network of states in units of their sizes."""
-
-    def __init__(self, net: nn.Module, size: Tensor) -> None:
-        super().__init__()
-        self.net, self.size = net, size
-
-    def forward(self, s: Tensor) -> Tensor:
-        return MOVE * self.net(s / self.size)
+    return lambda s: MOVE * net(s / size)
 
 
 def improved(plant: Masses, seed: int) -> qm.QPMPC:
@@ -264,17 +253,19 @@ def on_a_controller(design: Any, plant: Masses, seed: int) -> str:
     return f"{(text + data) / 1e3:.0f}, {slowest:.0f}"
 
 
-def measured(seeds: list[int], names: list[str]) -> dict[str, list[float]]:
-    """Return J of each design by seed, relative to that of N = 40."""
+def measured(seeds: list[int], names: list[str]) -> tuple[dict[str, list[float]], dict[str, Any]]:
+    """Return J of each design by seed, relative to that of N = 40, and the first seed's designs."""
     ratios: dict[str, list[float]] = {name: [] for name in names}
+    first: dict[str, Any] = {}
     for seed in seeds:
         plant = masses(seed)
-        designs = {name: policy_of(DESIGNS[name](plant, seed)) for name in names}
-        costs = {name: J(policy, plant, 10_000 + seed) for name, policy in designs.items()}
+        designs = {name: DESIGNS[name](plant, seed) for name in names}
+        costs = {name: J(policy_of(x), plant, 10_000 + seed) for name, x in designs.items()}
+        first = first or designs
         for name, cost in costs.items():
             ratios[name].append(cost / costs["N = 40"])
         print(seed, *(f"{name}: {ratios[name][-1]:.3f}" for name in names), sep=", ", flush=True)
-    return ratios
+    return ratios, first
 
 
 def main() -> None:
@@ -285,12 +276,11 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    ratios, rows = measured(options.seeds, options.designs), []
+    (ratios, designs), rows, seed = measured(options.seeds, options.designs), [], options.seeds[0]
     del ratios["N = 40"]
     for name, own in ratios.items():
-        plant, seed = masses(options.seeds[0]), options.seeds[0]
         numbers = f"{np.median(own):.3f}", f"{min(own):.3f} to {max(own):.3f}"
-        rows.append([name, *numbers, on_a_controller(DESIGNS[name](plant, seed), plant, seed)])
+        rows.append([name, *numbers, on_a_controller(designs[name], masses(seed), seed)])
     head = ["J relative to N = 40", "median", "range", "kB, microseconds in C"]
     text = table(head, rows)
     print(text)

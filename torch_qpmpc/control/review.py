@@ -277,10 +277,8 @@ def _limits(design: Design, target: Target, known: Array) -> str:
     """Return what a user can do about the bounds that a target is at."""
     bands, named = design.bands, []
     x = bands.W @ np.concatenate((target.y.numpy(), target.u.numpy()))
-    near = OFFSET * np.abs(bands.W) @ np.append(design.scaling.y, design.scaling.u)
-    lower, upper = (
-        side + bands.K @ (known - design.nominal) for side in (bands.lower, bands.upper)
-    )
+    near = OFFSET * bands.sizes(design.scaling.y, design.scaling.u)
+    lower, upper = bands.at(known - design.nominal)
     at = ((x <= lower + near) | (x >= upper - near)) & bands.W.any(1)
     for argument in dict.fromkeys(bands.arguments[at]):
         names = dict.fromkeys(bands.names[at & (bands.arguments == argument)])
