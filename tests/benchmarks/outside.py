@@ -36,6 +36,7 @@ import torch
 from scipy.optimize import linprog
 
 import train
+from tests.benchmarks import plants
 from tests.benchmarks.table import DOCS
 from tests.runs import compose_config
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
@@ -119,6 +120,18 @@ PCGYM: dict[str, dict[str, Any]] = {
         },
         "x0": np.array([*[350.0, 340.0, 310.0] * 8, 320.0]),
     },
+    "polymerisation_reactor": {
+        "N": 60,
+        "tsim": 2,
+        "SP": {"M": [3.0] * 60},
+        "r_scale": {"M": 10.0},
+        "o_space": {"low": np.array([300.0, 0, 0, 1.5]), "high": np.array([400.0, 10, 1, 3.5])},
+        "a_space": {
+            "low": np.array([0.1, 320.0, 4.0, 0.3]),
+            "high": np.array([2.0, 360.0, 8.0, 1.0]),
+        },
+        "x0": np.array([340.0, 5.0, 0.3, 3.0]),
+    },
     "nonsmooth_control": {
         "N": 60,
         "tsim": 5,
@@ -135,23 +148,24 @@ def pcgym_parameters(model: str) -> dict[str, Any]:
     common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
     own = PCGYM[model]
     common |= {"r_scale": dict.fromkeys(own["SP"], 1e3), "integration_method": "casadi"}
-    if model == "heat_exchanger":  # make_env cannot make it by its name
-        own = {**own, "custom_model": HeatExchanger()}
+    if model in ("heat_exchanger", "polymerisation_reactor"):
+        own = {**own, "custom_model": CustomModel(model)}
     return {**common, **own, "model": model}
 
 
-class HeatExchanger:
-    """pcgym's heat exchanger, which unpacks what CasADi does not let it unpack."""
+class CustomModel:
+    """A model of pcgym that its make_env cannot make by name."""
 
     int_method = "casadi"
 
-    def __init__(self) -> None:
-        self.model = import_module("pcgym.model_classes").heat_exchanger()
+    def __init__(self, name: str) -> None:
+        self.model = getattr(import_module("pcgym.model_classes"), name)()
         self.info = self.model.info
 
     def __call__(self, x: Any, u: Any) -> Any:
-        split = import_module("casadi").vertsplit
-        return self.model(split(x), split(u))
+        split = import_module("casadi").vertsplit  # CasADi's vectors are not unpacked
+        fmax = import_module("casadi").fmax  # an integration step may go below zero
+        return self.model([fmax(e, 0.0) for e in split(x)], split(u))
 
 
 class PcGym(gymnasium.Wrapper):
@@ -318,6 +332,11 @@ def propofol_rule() -> float:
     return J / episodes
 
 
+def _own(name: str, make: Callable[..., gymnasium.Env], rule: Callable[[int], float]) -> Outside:
+    id = _registered(f"{name}-v0", make, 100)
+    return Outside(id, "gymnasium", partial(rule, EVAL_SEED))
+
+
 def _registered(name: str, make: Callable[..., gymnasium.Env], steps: int) -> str:
     if name not in gymnasium.registry:  # this module is __main__, too
         gymnasium.register(name, entry_point=make, max_episode_steps=steps)
@@ -344,6 +363,9 @@ PLANTS = {
     "pcgym cstr": _pcgym("cstr"),
     "pcgym four_tank": _pcgym("four_tank"),
     "pcgym multistage_extraction": _pcgym("multistage_extraction"),
+    "pcgym polymerisation_reactor": _pcgym("polymerisation_reactor"),
+    "Cart-pole from hanging": _own("SwingUp", plants.CartPole, plants.cross_entropy),
+    "Two stocks in a row": _own("TwoStocks", plants.TwoStocks, plants.base_stocks),
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium"),
     "Lunar lander": Outside("LunarLander-v3", "Box2D", None, LUNAR),
     "Swimmer": Outside("Swimmer-v5", "mujoco"),
