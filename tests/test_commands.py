@@ -151,7 +151,7 @@ SHORT = {
     "python -m tests.campaign.numerics --solver NAME": Short("--solver daqp"),
     "python -m tests.campaign.rounding": Short("--count 40 --controllers 1 --seed 71"),
     "python -m tests.campaign.export --count 100000 --write": Short("--count 20"),
-    "python -m tests.campaign.units --compiled 200": Short("--count 2 --compiled 1 --first 71"),
+    "python -m tests.campaign.units": Short("--count 2 --compiled 1 --first 71"),
     "python -m tests.campaign.soak": Short("--steps 5000"),
     "python -m tests.faults.kill --count 20": Short("--count 1 --seed 71"),
     "python -m tests.faults.long": Short("--updates 200 seed=71"),
