@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
@@ -61,7 +62,17 @@ def test_few_pairs_or_errors_of_zero_have_weight_one():
     assert (inverse_variance(p, a, value, torch.zeros(COUNT).double(), use) == 1).all()
 
 
-def test_equal_inputs_leave_the_weights_finite():
-    p, a, value, use = (x[:50] for x in pairs())
-    weight = inverse_variance(0 * p, a, 0 * value, a[:, 0], use)
-    assert weight.isfinite().all()
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_equal_inputs_leave_the_weights_finite(dtype):
+    p, a, value, use = (x[:32] for x in pairs())
+    inputs = (0 * p, 0 * a, 0 * value + 1, a[:, 0])
+    weight = inverse_variance(*(x.to(dtype) for x in inputs), use)
+    assert_close(weight, torch.ones(32, dtype=dtype))
+
+
+def test_a_batch_in_float32_has_the_weights_of_float64():
+    p, a, value, use = pairs()
+    inputs = (p, a, value, a[:, 0] * normal(COUNT, seed=3))
+    weight = inverse_variance(*inputs, use)
+    single = inverse_variance(*(x.float() for x in inputs), use)
+    assert_close(single, weight.float(), rtol=1e-3, atol=0)

@@ -96,18 +96,18 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
     one. p is ``(B, n_p)``, a ``(B, n_u)``, and ``value`` Q(p, a) and ``error`` are ``(B,)``.
     """
     weight = torch.ones_like(error)
-    square = error[use].square()
+    p, a, value, square = (x[use].double() for x in (p, a, value, error.square()))
     if len(square) < LEAST or not square.any():
         return weight
-    inputs = _square(p[use]), _square(a[use]), value[use].abs()
-    logs = [torch.log(OFFSET + x.to(square) / _positive(x.mean())) for x in inputs]
+    inputs = _square(p), _square(a), value.abs()
+    logs = [torch.log(OFFSET + x / _positive(x.mean())) for x in inputs]
     features = F.pad(torch.stack(logs, -1), (1, 0), value=1.0)
     offset = FLOOR * square.median() + TINY * square.mean()
     gram = features.mT @ features + TINY * len(square) * torch.eye(4).to(square)
     beta = torch.linalg.solve(gram, features.mT @ torch.log(square + offset))
     log_variance = features @ beta
     inverse = 1 / torch.exp(log_variance - log_variance.median()).clamp(min=FLOOR)
-    weight[use] = inverse / inverse.mean()
+    weight[use] = (inverse / inverse.mean()).to(weight)
     return weight
 
 
