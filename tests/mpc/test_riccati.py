@@ -7,7 +7,7 @@ from torch.testing import assert_close
 import torch_qpmpc as qm
 from torch_qpmpc import QPMPC
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
+from torch_qpmpc.mpc.riccati import affine_cost_to_go, lqr_gain, riccati_weight
 
 A = torch.tensor([[1.1, 0.2], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0, 0.1], [0.3, 0.2]]).double()
@@ -42,7 +42,10 @@ def test_an_action_without_any_cost_has_no_effect_on_it():
     assert_close(c, torch.tensor(4 / 7 + 8 / 21).double())
 
 
-def test_a_weight_may_be_asymmetric_by_rounding():
-    rounded = W.clone()
-    rounded[0, 1] += 1e-13
-    assert_close(riccati_weight(A, B, rounded), riccati_weight(A, B, W), atol=1e-11, rtol=0)
+def test_a_weight_may_be_asymmetric():
+    offset, q, P = A[0], W[0], riccati_weight(A, B, W, GAMMA)
+    upper = 2 * W.triu() - W.diagonal().diag()  # the same cost
+    assert_close(riccati_weight(A, B, upper, GAMMA), P, atol=1e-11, rtol=0)
+    assert_close(lqr_gain(A, B, upper, GAMMA), lqr_gain(A, B, W, GAMMA), atol=1e-11, rtol=0)
+    costs = (affine_cost_to_go(A, B, offset, x, q, P, GAMMA) for x in (upper, W))
+    assert_close(*costs, atol=1e-11, rtol=0)

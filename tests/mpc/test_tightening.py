@@ -96,6 +96,7 @@ def test_bounds_that_would_cross_meet_halfway_and_infinite_ones_stay():
     [
         (lambda: tighten(scheme(), SIGMA, 0.4), "probability: got 0.4, expected a probability in"),
         (lambda: tighten(scheme(), SIGMA[1:]), "covariances: got shape .* expected shape"),
+        (lambda: tighten(scheme(), SIGMA / 0), "covariances: got NaN or inf, expected finite"),
         (lambda: tighten(scheme(), SIGMA, K=SIGMA[0]), "K: got shape .* expected shape"),
         (lambda: tighten(None, SIGMA), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
         (

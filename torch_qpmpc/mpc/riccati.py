@@ -27,7 +27,7 @@ def lqr_gain(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tensor:
         W: weight of the stage cost ``1/2 [x; u]' W [x; u]``, ``(n_x + n_u, n_x + n_u)``.
         gamma: discount of the stage costs.
     """
-    n_x, B, W = len(A), B.to(A), W.to(A)
+    n_x, B, W = len(A), B.to(A), (W + W.mT).to(A) / 2
     P = riccati_weight(A, B, W, gamma)
     left = W[n_x:, n_x:] + gamma * B.mT @ P @ B
     return torch.linalg.solve(left, gamma * B.mT @ P @ A + W[n_x:, :n_x])
@@ -71,7 +71,7 @@ def affine_cost_to_go(
     Without active bounds, an MPC scheme with H_f = P and q_f = p is the optimal policy, for any
     horizon. Without a discount c has no finite value. P is the `riccati_weight` of A, B and W.
     """
-    n_x = len(A)
+    n_x, W = len(A), (W + W.mT) / 2
     # The regulator is u = -K x - k; an action without any cost has none.
     M = torch.linalg.pinv(W[n_x:, n_x:] + gamma * B.mT @ P @ B, hermitian=True)
     K = M @ (W[n_x:, :n_x] + gamma * B.mT @ P @ A)

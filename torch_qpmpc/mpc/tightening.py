@@ -61,6 +61,9 @@ def tighten(
     check_kind("mpc", mpc, QPMPC)
     n_x, n_u, N = mpc.n_x, mpc.n_u, mpc.horizon
     check_tensor("covariances", covariances, N + 1, n_x, n_x, batched=False)
+    if not covariances.isfinite().all():
+        remedy = "Shorten the horizon, or pass those of A + B K."
+        raise QPError.expected("covariances", "NaN or inf", "finite entries", remedy)
     valid = "a probability in [0.5, 1)"
     check_number("probability", probability, lambda x: 0.5 <= x < 1, valid)
     if learned := {"lb", "ub"} & {*mpc.learned}:
