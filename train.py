@@ -42,10 +42,8 @@ from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.launch import (
-    Interrupt,
     check_overrides,
     launched,
-    same_command,
     settled,
 )
 from torch_qpmpc.experiment.metrics import (
@@ -74,19 +72,11 @@ def train(
 ) -> dict[str, Any]:
     """Train from the beginning, or from the ``state`` of a checkpoint.
 
-    A ``quiet`` run, as in a sweep, prints nothing and leaves signals to the launcher.
+    It writes a checkpoint at each evaluation. A ``quiet`` run, as in a sweep, prints nothing.
 
     Returns:
         The content of summary.json.
     """
-    interrupt = Interrupt()
-    with contextlib.nullcontext() if quiet else interrupt:
-        return _train(cfg, folder, state, quiet, interrupt)
-
-
-def _train(
-    cfg: Config, folder: str, state: dict[str, Any] | None, quiet: bool, interrupt: Interrupt
-) -> dict[str, Any]:
     torchrl_logger.setLevel("WARNING")
     torch.manual_seed(cfg.seed)
     torch.set_num_threads(cfg.threads)
@@ -117,7 +107,6 @@ def _train(
         stack.callback(collector.shutdown)
         after = None if state is None else state["update"]
         run = stack.enter_context(RunFolder(folder, cfg, after))
-        command = f"go on with {same_command(run.path)}"
 
         # Warm up, or resume.
         if state is None:
@@ -126,7 +115,6 @@ def _train(
             for batch in itertools.islice(stream, warm_up):
                 learner.loss_module.observe(batch)
                 replay.extend(batch)
-                interrupt.exit_if_signalled(f"Stopped before the first update: {command}")
             if identified is not None and identified.cost is not None and warm_up:
                 # Its constant is from the log: what random actions cost.
                 run.log({"train/centred": learner.centre(replay)}, 0)
@@ -140,8 +128,6 @@ def _train(
             # The last checkpoint has no transitions to identify a model from.
             if J := run.column(f"eval/J_{IDENTIFICATION}")[1]:
                 evaluation.rivals[IDENTIFICATION] = J[-1]
-        interrupt.exit_if_signalled(f"Stopped after update {tally.update}: {command}")
-
         changed, judged = False, {}  # what is kept, since its last evaluation; the last verdict
         shown: dict[str, str] = {}  # beside the bar
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -175,8 +161,7 @@ def _train(
             run.log(judged, update)
             changed |= not cfg.gate or bool(judged.get("gate/accepted"))
             last = update == cfg.updates
-            evaluated = last or update % cfg.eval_interval == 0
-            if evaluated:
+            if last or update % cfg.eval_interval == 0:
                 if changed:
                     evaluation.evaluate(gate.policy)
                     changed = False
@@ -186,13 +171,10 @@ def _train(
                 shown["J"], closed = cost_text(gap["J_best"]), gap["closed_gap"]
                 shown |= {"closed_gap": f"{closed:.3f}"} if math.isfinite(closed) else {}
                 progress.set_postfix(shown)
-            if evaluated or interrupt.signum is not None:
                 run.flush()
                 state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)
                 save_file(run.path / CHECKPOINT, KIND, state)
                 gate.save(run.path)
-            if not last:
-                interrupt.exit_if_signalled(f"Stopped after update {update}: {command}")
 
         gate.save(run.path)
         if cfg.figures:
@@ -232,6 +214,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main()
     except KeyboardInterrupt:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +16,28 @@ from torch_qpmpc.experiment.run_folder import read_config
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 
-def stop(
-    monkeypatch: pytest.MonkeyPatch,
-    cfg: Config,
-    folder: Path,
-    update: int,
-    signum: int = signal.SIGTERM,
-) -> int:
-    """Run or resume until ``update``, send a signal there, and return the exit code."""
+def stop(monkeypatch: pytest.MonkeyPatch, cfg: Config, folder: Path, update: int) -> None:
+    """Run or resume, and stop in ``update``."""
     state = None
     if (folder / "config.yaml").exists():
         cfg, state = begun(folder)
-    left = update - (state["update"] if state else 0)
-    entered = []
+    with monkeypatch.context() as patch:
+        interrupt(patch, update - (state["update"] if state else 0))
+        with pytest.raises(KeyboardInterrupt):
+            train.train(cfg, str(folder), state)
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
+    """Make the update of this number raise what Ctrl-C does."""
+    enter, entered = SolveLog.__enter__, []
 
     def count(log: SolveLog) -> SolveLog:
         entered.append(log)
-        if len(entered) == left:
-            signal.raise_signal(signum)
+        if len(entered) == update:
+            raise KeyboardInterrupt
         return enter(log)
 
-    enter = SolveLog.__enter__
-    with monkeypatch.context() as patch:
-        patch.setattr(SolveLog, "__enter__", count)
-        with pytest.raises(SystemExit) as ended:
-            train.train(cfg, str(folder), state)
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
+    monkeypatch.setattr(SolveLog, "__enter__", count)
 
 
 def begun(folder: Path) -> tuple[Config, dict[str, Any] | None]:

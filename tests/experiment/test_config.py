@@ -103,7 +103,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("optimizer.betas", [0.9], "got [0.9], but list should have at least 2 items after validation"),
     ("task", 3, "got 3, expected its keys, as in configs/task/."),
     ("task.name", "unknown", "got 'unknown', expected one of "),
-    ("task.A", [[1.0], [1.0, 2.0]], "but value error, rows should be equally long."),
+    ("task.A", [[1.0], [1.0, 2.0]], "but rows should be equally long."),
     ("task.id", "???", "got '???', expected the id of a Gymnasium environment, as in task.id="),
     ("batchsize", 3, "got an unknown key, expected a key of the chosen groups. Did you mean batch"),
     ("taks", 3, "got an unknown key, expected a key of the chosen groups. Did you mean task?"),

@@ -50,20 +50,17 @@ def start_of(cfg: Config):
 # Exploration
 
 
-@pytest.mark.parametrize("binary", [False, True])
-def test_exploration_holds_random_levels(binary):
+def test_exploration_holds_random_levels():
     low, high = torch.tensor([-1.0, 0.0]).double(), torch.tensor([1.0, 4.0]).double()
-    explore = Exploration(low, high, 5.0, binary, seed=0)
+    explore = Exploration(low, high, 5.0, seed=0)
     actions = torch.stack([explore(torch.zeros(100, 3)) for _ in range(200)])
     assert actions.dtype == torch.float32
     assert ((actions >= low) & (actions <= high)).all()
     changes = (actions[1:] != actions[:-1]).double().mean()
-    # A new level of a binary signal is the old one half of the time.
-    assert changes == pytest.approx(0.1 if binary else 0.2, rel=0.1)
-    levels = actions.flatten(0, 1).unique(dim=0)
-    assert len(levels) == 4 if binary else len(levels) > 1000
+    assert changes == pytest.approx(0.2, rel=0.1)
+    assert len(actions.flatten(0, 1).unique(dim=0)) > 1000
     assert_close(actions.mean((0, 1)), torch.tensor([0.0, 2.0]), atol=0.1, rtol=0)
-    again = Exploration(low, high, 5.0, binary, seed=0)
+    again = Exploration(low, high, 5.0, seed=0)
     assert torch.equal(again(torch.zeros(100, 3)), actions[0])
 
 
@@ -71,7 +68,7 @@ def test_infinite_bounds_cannot_be_explored():
     low = torch.tensor([-torch.inf]).double()
     message = r"start: got actions from \[-inf\] to \[inf\], expected finite bounds to explore"
     with pytest.raises(QPError, match=message):
-        Exploration(low, -low, 4.0, False, 0)
+        Exploration(low, -low, 4.0, 0)
 
 
 def test_a_log_is_of_the_runs_environments():

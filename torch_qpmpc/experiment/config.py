@@ -152,7 +152,6 @@ class FromData(Group):
     name: Literal["data"]
     file: str | None
     transitions: Count
-    levels: Literal["uniform", "binary"]
     hold: Annotated[float, Field(ge=1)]
 
 
@@ -300,7 +299,8 @@ def _named(error: Any) -> QPError:
     if kind.startswith("union_tag"):
         key, value = f"{key}.name", value.get("name")
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
-    words = f"{error['msg'][:1].lower()}{error['msg'][1:]}"
+    words = error["msg"].removeprefix("Value error, ")
+    words = f"{words[:1].lower()}{words[1:]}"
     return QPError(printable(f"{key}: got {got}, but {words}."))
 
 

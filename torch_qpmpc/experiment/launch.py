@@ -1,12 +1,12 @@
-"""Launch of a run: its folder, its lock, its signals, and its errors as one-sentence messages."""
+"""Launch of a run: its folder, its lock, its end by Ctrl-C, and its errors as one sentence."""
 
 from __future__ import annotations
 
+import logging
 import re
 import shlex
 import shutil
 import signal
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,20 +84,30 @@ def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
 def launched() -> Iterator[tuple[str, bool]]:
     """Lock the run's folder, yield it and True in a sweep, and exit with one sentence on an error.
 
-    In a sweep the error is raised instead, because an exit would end the other runs.
+    After Ctrl-C it names the command that goes on. In a sweep both are raised instead, because an
+    exit would end the other runs. Warnings go to Hydra's train.log, too.
     """
     hydra = HydraConfig.get()
     sweep = hydra.mode is RunMode.MULTIRUN
     folder = hydra.runtime.output_dir
+    logging.captureWarnings(True)
     try:
         with locked(folder, f"{_key(sweep)}=FOLDER"):
             yield folder, sweep
     except (QPError, OSError) as error:
         if sweep:
+            error.add_note(f"The run is that of {folder}.")
             raise
         if isinstance(error, OSError):
             error = unwritable(folder, error)
         raise SystemExit(str(error)) from None
+    except KeyboardInterrupt:
+        if sweep:
+            raise
+        print(f"\nStopped: go on with {same_command(folder)}", flush=True)
+        raise SystemExit(128 + signal.SIGINT) from None
+    finally:
+        logging.captureWarnings(False)
 
 
 @contextmanager
@@ -110,43 +120,6 @@ def locked(folder: str | Path, elsewhere: str) -> Iterator[None]:
         remedy = f"Wait until that run has ended, or choose another folder with {elsewhere}."
         got, want = f"{folder}, in use by another process", "one that no run is using"
         raise QPError.expected("folder", got, want, remedy) from None
-
-
-class Interrupt:
-    """Records the first SIGINT or SIGTERM inside a ``with`` block; a second one acts as usual.
-
-    It records nothing outside the main thread, where Python delivers signals.
-
-    Example:
-        >>> with Interrupt() as interrupt:
-        ...     signal.raise_signal(signal.SIGTERM)
-        >>> interrupt.signum == signal.SIGTERM
-        True
-    """
-
-    def __init__(self) -> None:
-        self.signum: int | None = None
-        self._usual = {}
-
-    def __enter__(self) -> Interrupt:
-        if threading.current_thread() is threading.main_thread():
-            for signum in (signal.SIGINT, signal.SIGTERM):
-                self._usual[signum] = signal.signal(signum, self._note)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        while self._usual:
-            signal.signal(*self._usual.popitem())
-
-    def exit_if_signalled(self, sentence: str) -> None:
-        """Print ``sentence`` and exit with the signal's code if one was recorded."""
-        if self.signum is not None:
-            print(f"\n{sentence}", flush=True)
-            raise SystemExit(128 + self.signum)
-
-    def _note(self, signum: int, frame: object) -> None:
-        self.signum = signum
-        self.__exit__()
 
 
 class SubFolders(Callback):

@@ -69,7 +69,7 @@ class Tally:
     def add(self, batch: TensorDictBase, terms: Mapping[str, Tensor]) -> None:
         """Add an update with its collected batch and the terms of its loss."""
         self.update += 1
-        self.accepted += bool(terms.get("train/accepted", 1))
+        self.accepted += bool(terms["train/accepted"])
         self.costs.append(-batch["next", "reward"].nanmean().item())
 
     def metrics(self) -> dict[str, float]:

@@ -35,17 +35,16 @@ class Exploration(nn.Module):
     """Random actions that stay constant for a random number of steps.
 
     At each step, each entry of each episode's action keeps its level or, with probability
-    1 / ``hold``, gets a new one: a uniform level within the bounds ``(n_u,)`` or, if ``binary``,
-    one of the bounds (a pseudo-random binary signal).
+    1 / ``hold``, gets a new one, uniform within the bounds ``(n_u,)``.
     """
 
-    def __init__(self, low: Tensor, high: Tensor, hold: float, binary: bool, seed: int) -> None:
+    def __init__(self, low: Tensor, high: Tensor, hold: float, seed: int) -> None:
         super().__init__()
         if not (low.isfinite() & high.isfinite()).all():
             got = f"actions from {low.tolist()} to {high.tolist()}"
             remedy = "Collect a log with actions of your own, and pass it as start.file."
             raise QPError.expected("start", got, "finite bounds to explore between", remedy)
-        self.low, self.high, self.hold, self.binary = low, high, hold, binary
+        self.low, self.high, self.hold = low, high, hold
         self.generator = torch.Generator().manual_seed(seed)
         self.action: Tensor | None = None
 
@@ -53,8 +52,6 @@ class Exploration(nn.Module):
         """Return the next action ``(*batch, n_u)`` for any observation ``(*batch, n)``."""
         shape = (*observation.shape[:-1], len(self.low))
         level, change = torch.rand((2, *shape), generator=self.generator, dtype=torch.float64)
-        if self.binary:
-            level = level.round()
         level = self.low + level * (self.high - self.low)
         if self.action is not None:
             level = torch.where(change < 1 / self.hold, level, self.action)
@@ -114,8 +111,7 @@ def collect_log(cfg: Config, physics: AnyPlant) -> TensorDict:
     options = cfg.start
     assert options.name == "data"
     env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
-    binary = options.levels == "binary"
-    explore = Exploration(physics.lb_a, physics.ub_a, options.hold, binary, cfg.seed)
+    explore = Exploration(physics.lb_a, physics.ub_a, options.hold, cfg.seed)
     module = TensorDictModule(explore, ["observation"], ["action"])
     steps = -(-options.transitions // cfg.num_envs)
     log = env.rollout(steps, module, break_when_any_done=False).contiguous()

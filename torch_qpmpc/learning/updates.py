@@ -50,17 +50,18 @@ def first_order(
         if si is not None and windows is not None:
             terms["loss/si"] = si(mpc.C, windows, mpc.b.detach())
         total = torch.stack([*terms.values()]).sum()
+        moves = losses["unsolved"] + losses["invalid_reward"] < batch.numel() and total.isfinite()
         optimizer.zero_grad()
-        if losses["unsolved"] + losses["invalid_reward"] == batch.numel() or not total.isfinite():
-            return terms, losses
-        total.backward()
-        gradients = [x.grad for group in optimizer.param_groups for x in group["params"]]
-        if not all(gradient is None or gradient.isfinite().all() for gradient in gradients):
-            return terms, losses
-        optimizer.step()
-        mpc.project_()
-        if deviation is not None:
-            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+        if moves:
+            total.backward()
+            gradients = [x.grad for group in optimizer.param_groups for x in group["params"]]
+            moves = all(gradient is None or gradient.isfinite().all() for gradient in gradients)
+        if moves:
+            optimizer.step()
+            mpc.project_()
+            if deviation is not None:
+                deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+        terms["train/accepted"] = torch.tensor(float(moves))
         return terms, losses
 
     return update
@@ -89,7 +90,6 @@ def second_order(
         remedy = "Learn with first_order and a torch optimiser."
         got = "a value network with theta_keys or upstream modules"
         raise QPError.expected("loss_module", got, "a QPActorValueOperator alone", remedy)
-    action = network.in_keys[1]
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         target, terms, penalty = loss_module.target(batch).reshape(-1), {}, None
@@ -98,7 +98,7 @@ def second_order(
             terms["loss/si"] = si(mpc.C, windows, mpc.b)
         key, pairs = network.active_set_key, batch.reshape(-1)
         start = None if key is None else pairs.get(key, None)
-        p, a = network.known(pairs), pairs.get(action)
+        p, a = network.known(pairs), pairs.get(network.in_keys[1])
         report = optimizer.step(p, a, -target, penalty=penalty, warm_start=start)
         if key is not None:
             batch.set(key, report.solution.active.view(*batch.shape, -1))

@@ -35,7 +35,7 @@ def start(id: str | None, seed: int) -> Start:
         env = plant.vectorised(16, 50, seed=seed)
         return Start(env, mpc, lambda policy: closed_loop(policy, plant).J, bounds)
     env = plant.vectorised(16, None, seed=seed)
-    random = Exploration(*bounds, hold=4, binary=False, seed=seed)  # 4 steps on average
+    random = Exploration(*bounds, hold=4, seed=seed)  # 4 steps on average
     module = TensorDictModule(random, ["observation"], ["action"])
     log = env.rollout(125, module, break_when_any_done=False)
     mpc = qm.QPMPC.from_data(log, 10, gamma=0.98, **options)

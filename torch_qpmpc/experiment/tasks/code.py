@@ -33,6 +33,8 @@ def run_code(cfg: DictConfig) -> Config:
     Raises:
         QPError: the code cannot be run, or the configuration is invalid.
     """
+    if (here := str(Path.cwd())) not in sys.path:  # where train.py need not be
+        sys.path.append(here)
     name, file = str(cfg.task.get("name")), cfg.task.get("file")
     if file is not None and name not in TASKS:
         expected = f"the Python file that registers task={name}"

@@ -35,7 +35,7 @@ from torch_qpmpc.mpc.riccati import (
     terminal_riccati,
 )
 from torch_qpmpc.mpc.scheme import Scheme
-from torch_qpmpc.mpc.stage_cost import GOOD, StageCost, fit_rewards, poor, scheme_cost
+from torch_qpmpc.mpc.stage_cost import StageCost, fit_rewards, scheme_cost
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 if TYPE_CHECKING:
@@ -99,9 +99,7 @@ class Start(NamedTuple):
         parts += [f"Model of order {len(self.model.A)}, with poles of sizes {poles}"]
         parts += [NETWORKS] * (self.dynamics is not None)
         if self.cost is not None:
-            R2 = self.cost.R2
-            parts += [f"stage cost fitted to the rewards: R2 {R2:.3f}"]
-            parts += [poor(R2)] * (not R2 >= GOOD)
+            parts += [f"stage cost fitted to the rewards: R2 {self.cost.R2:.3f}"]
         return "\n".join(str(part) for part in (*parts, self.choice) if part is not None)
 
     @property
@@ -138,15 +136,14 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     return start._replace(cost=fit_rewards(steps, start.layout, diagonal, start.model))
 
 
-def nonlinear_start(cfg: Config, physics: AnyPlant, log: Any) -> Start | None:
-    """Return nonlinear MPC of the outputs of a log; None if no network predicts them better.
+def nonlinear_start(cfg: Config, physics: AnyPlant, start: Start) -> Start | None:
+    """Return ``start``, of outputs, with networks; None if none predicts the outputs better.
 
     None, too, with known signals, or where C and b, which it lacks, are needed.
     """
     rest = {*cfg.task.learn_cost, *cfg.constraint.learn} - {"C", "b"}
     if isinstance(physics, LinearSystem | Plant) or cfg.constraint.si is not None or not rest:
         return None
-    start = identified_start(cfg, physics, log, order=0)
     kept = valid_steps(start.log)
     x, u, after = (start.log[key].double()[kept] for key in ("observation", "action", NEXT))
     cost = None if start.cost is None else -_rewards(start.log)[kept]
