@@ -143,8 +143,7 @@ def train(
                 times.append(time.perf_counter())
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
-                long_enough = (warm_up + update) * cfg.steps_per_update >= cfg.task.horizon
-                penalised = learner.si is not None and long_enough
+                penalised = learner.si is not None and replay.windows.can_sample()
                 windows = replay.sample_tau() if penalised else None
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:

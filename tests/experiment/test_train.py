@@ -115,6 +115,17 @@ def test_the_si_penalty_begins_with_the_first_window_of_n_steps(tmp_path):
     assert metrics(tmp_path)["loss/si"].isna().tolist() == [True, True, False, False, False]
 
 
+def test_without_an_episode_of_n_steps_a_run_has_no_si_penalty(tmp_path, monkeypatch):
+    vectorised = PointMass.vectorised
+    monkeypatch.setattr(
+        PointMass, "vectorised", lambda self, n, _, seed: vectorised(self, n, 2, seed)
+    )
+    run_small(tmp_path, "constraint=si", "task.horizon=3", "updates=8")
+    table = metrics(tmp_path)
+    assert table.index[-1] == 8
+    assert "loss/si" not in table
+
+
 def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     stream = ("task=gros_zanon", "solver=daqp", "task.horizon=4", "task.eval_steps=20")
     stream += ("figures=false", "gate=false", "rivals=false", "replay=false", "seed=69")
