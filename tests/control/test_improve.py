@@ -70,9 +70,9 @@ def test_its_gradient_is_that_of_finite_differences(case):
     mpc, plant = controller.mpc.plan, loops(controller)
 
     def cost() -> torch.Tensor:
-        return _Loops(plant, 3, 1).run(mpc, 6).costs.mean()
+        return _Loops(plant, 3, 3).run(mpc, 6).costs.mean()
 
-    _Loops(plant, 3, 1).mean_cost(mpc, 6).backward()
+    _Loops(plant, 3, 3).mean_cost(mpc, 6).backward()
     generator, moved = torch.Generator().manual_seed(2), set()
     for name, leaf in mpc.coordinates().items():
         if not isinstance(leaf, torch.nn.Parameter) or leaf.grad is None:

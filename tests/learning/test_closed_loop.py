@@ -301,3 +301,21 @@ def test_simulated_noise_grows_as_the_logs():
         after = plant.known(plant.step(s, u, plant.draw(draw, 4000)))
         e = after - 0.8 * plant.known(s) - u
         assert e.std().item() == pytest.approx(np.hypot(1.2 * level, 0.02), rel=0.15, abs=0.1)
+
+
+def test_where_noise_grows_the_sensors_part_neither_grows_nor_moves_the_state():
+    rng, logs = np.random.default_rng(0), []
+    for _ in range(40):
+        x, u = [rng.normal(size=1)], rng.uniform(-1, 1, (60, 1))
+        for k in range(60):
+            x.append(0.8 * x[-1] + u[k] * (1 + rng.normal(size=1)) + 0.02 * rng.normal(size=1))
+        logs.append({"y": np.array(x) + 0.2 * rng.normal(size=(61, 1)), "u": u})
+    plant = simulated_plant(identify(logs, order=1), lambda p, u: p.sum(-1), 5, members=1)
+    draw = torch.Generator().manual_seed(0)
+    s = plant.starts(draw, 2000)
+    for level, std in ((1.0, 1.0 / 0.6), (0.0, 0.02 / 0.6)):
+        for _ in range(40):
+            s = plant.step(s, torch.full((2000, 1), level).double(), plant.draw(draw, 2000))
+        assert s[:, 0].std().item() == pytest.approx(std, rel=0.4, abs=0.1)
+    own, _, y, *_ = plant._parts(s)
+    assert (y - plant._own.at("C", own)).std().item() == pytest.approx(0.2, rel=0.3)

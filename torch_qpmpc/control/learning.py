@@ -349,9 +349,9 @@ class ControlledPlant(SimulatedPlant):
         return s.split(self._ends, -1)[-1]
 
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
-        (base, _, r, *_), (e, aims) = s.split(self._ends, -1), nu.split(self._sizes[2], -1)
+        (base, _, r, *_), (*e, aims) = s.split(self._ends, -1), nu.split(self._sizes[2], -1)
         u = self._input(s, a)
-        base = super().step(base, u, e)
+        base = super().step(base, u, torch.cat(e, -1))
         moves = base[:, -2].detach() % max(self._horizon // 2, 1) == 0
         moves &= torch.arange(len(s)) // self.members % 2 == 0
         return self._planned(base, u, torch.where(moves[:, None], aims, r))

@@ -39,6 +39,8 @@ STEPS = 1000
 METHODS = ("starts", "draw", "noise", "step", "cost")
 #: The level of the test of noise that grows.
 LEVEL = 0.01
+#: The least share of innovations at rest that moves the state.
+LEAST = 0.01
 #: Models of an ensemble.
 MEMBERS = 8
 #: The least steps of a piece of a log that is drawn again, in lags of its model and one.
@@ -53,9 +55,10 @@ class SimulatedPlant:
     """Identified models as a plant whose policy sees the estimate of a filter.
 
     Loop i runs with model i modulo their number. The state is [xi, xi_f, y, k, first]: the model's
-    own estimate, which its innovations move, that of the filter, the output, the step, by which the
-    gains vary, and the row of known signals at step zero. The innovations are drawn from those of
-    the log, scaled to the model's covariance and its `growth` with the state and the action.
+    own, which its innovations move, the filter's estimate, the output, the step, by which the gains
+    vary, and the row of known signals at step zero. The innovations are drawn from those of the
+    log, scaled to the model's covariance and its `growth` with the state and the action; where they
+    grow, the sensor's part is drawn apart: it does not grow, nor does it move the state.
 
     Loops start as the log's trajectories did or, with known signals, at its steps, from the
     estimates there; the signals go on as logged, and hold their last row.
@@ -82,8 +85,9 @@ class SimulatedPlant:
         self.members = len(models)
         seen = [filtered(model, log) for model in (*models, observer)]
         self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
-        noises = zip(*(_noise(x, self._u.numpy(), e) for x, e in seen[:-1]), strict=True)
-        self._residuals, self._growth = map(torch.stack, noises)
+        noises = (_noise(*own, self._u.numpy()) for own in zip(models, seen, strict=False))
+        noises = map(torch.stack, zip(*noises, strict=True))
+        self._residuals, self._growth, self._own.sensor = noises
         self._horizon, n_y = horizon, self._residuals.shape[-1]
         self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
         steps = torch.tensor([one.steps for one in log])
@@ -103,10 +107,10 @@ class SimulatedPlant:
             y = torch.where(self._y[row].isfinite(), self._y[row], self._own.at("C", x))
             k = torch.stack((row - self._first[row], self._first[row]), -1)
             return torch.cat((x, seen, y, k.to(x)), -1)
-        k, seen = torch.zeros(count, dtype=torch.int64), self._filter.x0.expand(count, -1)
-        x = self._own.x0[one]
-        e = torch.randn(count, self._sizes[2], generator=rng, dtype=x.dtype)
-        return self._measured(x, seen, self._own.at("roots", e, k), k, k)
+        x, seen = self._own.x0[one], self._filter.x0.expand(count, -1)
+        nu = torch.randn(count, 2 * self._sizes[2], generator=rng, dtype=x.dtype)
+        k = torch.zeros(count, 2, dtype=torch.int64)
+        return self._measured(x, seen, nu, x.new_ones(1), k)
 
     def known(self, s: Tensor) -> Tensor:
         """Return what the policy sees, p ``(count, n_p)``."""
@@ -126,9 +130,9 @@ class SimulatedPlant:
         return self._d[self._row(s, ahead)] if n_d else s.new_zeros(len(s), ahead + 1, 0)
 
     def draw(self, rng: torch.Generator, count: int) -> Tensor:
-        """Draw innovations of unit covariance, ``(count, n_y)``."""
-        chosen = torch.randint(self._residuals.shape[1], (count,), generator=rng)
-        return self._residuals[torch.arange(count) % self.members, chosen]
+        """Draw innovations and the sensor's noise, of unit covariance, ``(count, 2 n_y)``."""
+        chosen = torch.randint(self._residuals.shape[1], (2, count), generator=rng)
+        return torch.cat([*self._residuals[torch.arange(count) % self.members, chosen]], -1)
 
     def noise(self, nu: Tensor, draw: Tensor) -> Tensor:
         """Return the draw, as innovations are white."""
@@ -137,23 +141,24 @@ class SimulatedPlant:
     def step(self, s: Tensor, a: Tensor, nu: Tensor) -> Tensor:
         """Return the next states."""
         own, (x, seen, *_), d = self._own, self._parts(s), self._ahead(s)[:, 0]
-        k, first = s.detach()[:, -2:].long().unbind(-1)
+        k = s.detach()[:, -2:].long() + torch.tensor([1, 0])
         squares = torch.cat((x.new_ones(len(x), 1), x.square(), a.square()), -1)
         growth = self._growth[torch.arange(len(x)) % self.members]
-        e = own.at("roots", nu, k + 1) * (growth @ squares[..., None])[..., 0].sqrt()
-        return self._measured(own.moved(x, a, d), self._filter.moved(seen, a, d), e, k + 1, first)
+        size = (growth @ squares[..., None])[..., 0].sqrt()
+        return self._measured(own.moved(x, a, d), self._filter.moved(seen, a, d), nu, size, k)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return the costs of a step, ``(count,)``."""
         return self._cost(self.known(s), a)
 
-    def _measured(self, x: Tensor, seen: Tensor, e: Tensor, k: Tensor, first: Tensor) -> Tensor:
+    def _measured(self, x: Tensor, seen: Tensor, nu: Tensor, size: Tensor, k: Tensor) -> Tensor:
         """Return the states after an output, from their predictions."""
-        own, other = self._own, self._filter
-        y = own.at("C", x) + e
-        x = x + own.at("gains", e, k)
-        seen = seen + other.at("gains", y - other.at("C", seen), k)
-        return torch.cat((x, seen, y, k[:, None].to(x), first[:, None].to(x)), -1)
+        own, other, (e, v) = self._own, self._filter, nu.chunk(2, -1)
+        e = own.at("roots", e, k[:, 0]) * size
+        y = own.at("C", x) + e + own.at("sensor", v)
+        x = x + own.at("gains", e, k[:, 0])
+        seen = seen + other.at("gains", y - other.at("C", seen), k[:, 0])
+        return torch.cat((x, seen, y, k.to(x)), -1)
 
 
 class _Course:
@@ -173,7 +178,7 @@ class _Course:
             gains.append(np.concatenate((L, model.L[None]))[np.minimum(rows, len(L))])
             V = np.concatenate((V, model.S[None]))
             roots.append(np.array([_root(x) for x in V])[np.minimum(rows, len(L))])
-        self.gains, self.roots = _stacked(gains), _stacked(roots)
+        self.gains, self.roots, self.sensor = _stacked(gains), _stacked(roots), torch.empty(0)
 
     def at(self, name: str, x: Tensor, k: Tensor | None = None) -> Tensor:
         """Return the product of each loop's matrix, that of step k, and x ``(count, n)``."""
@@ -250,15 +255,28 @@ def filtered(model: Innovations, log: Sequence[Trajectory]) -> tuple[np.ndarray,
     return np.concatenate(x), np.concatenate(e)
 
 
-def _noise(x: np.ndarray, u: np.ndarray, e: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return innovations in unit covariance, and the `growth` of their variances."""
+def _noise(
+    model: Innovations, seen: tuple[np.ndarray, np.ndarray], u: np.ndarray
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return innovations in unit covariance, their variances' `growth`, and the sensor's root.
+
+    With R = (I - C L) S of the sensor, whose noise moves the estimate, too, R + (C A L) R (C A L)'
+    of S are its, but no more than S has at rest. Constant noise may as well move the state.
+    """
+    (x, e), (_, _, _, _, C, L, S, *_) = seen, model
     v = np.hstack((x, u))
-    seen = np.isfinite(e).all(1)
-    e, v = e[seen] - e[seen].mean(0), v[seen]
+    known = np.isfinite(e).all(1)
+    e, v = e[known] - e[known].mean(0), v[known]
     c = growth(e, v)
     e = e / np.sqrt(np.hstack((np.ones((len(v), 1)), v**2)) @ c.T)
     e = e @ np.linalg.pinv(_root(e.T @ e / len(e)), 1e-9, True)
-    return torch.as_tensor(e), torch.as_tensor(c)
+    grows = c[:, 1:].any(1)
+    R, K = (S - C @ L @ S) * np.outer(grows, grows), C @ model.A @ L
+    root, size = _root((R + R.T) / 2), np.where(grows, np.diag(S), np.inf)
+    share = np.square(np.hstack((root, K @ root))).sum(1) / size
+    c[:, 0] -= (part := np.minimum(share, (1 - LEAST) * c[:, 0]))
+    root *= np.sqrt(part / np.where(share > 0, share, 1.0))[:, None]
+    return torch.as_tensor(e), torch.as_tensor(c), torch.as_tensor(root)
 
 
 def growth(e: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -483,11 +501,11 @@ def improve(
     """
     check_kind("mpc", mpc, QPMPC)
     check_no_levels(mpc, "gradients of closed loops")
-    sizes = {"updates": updates, "loops": loops, "steps": steps, "members": members}
-    for name, size in sizes.items():
+    window = steps if window is None else window
+    own = {"updates": updates, "loops": loops, "steps": steps, "window": window, "members": members}
+    for name, size in own.items():
         check_whole(name, size, 1)
     check_whole("held_out", held_out, FEWEST)
-    check_whole("window", steps if window is None else window, 1)
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
     if isinstance(plant, Identified):
@@ -506,8 +524,7 @@ def improve(
     mpc.on_failure, curve = "mask", []
     try:
         old = tried()
-        descent = Descent(mpc, plant, loops, steps, rate, window)
-        descent.start(seeds[1])
+        descent = Descent(mpc, plant, loops, steps, window, rate, seeds[1])
         schedule = LinearLR(descent.optimizer, 1.0, 1 / updates, updates)
         for _ in range(updates):
             curve.append(descent.update(penalty).item())
@@ -521,17 +538,12 @@ def improve(
     test, members = PairedTest(), getattr(unseen, "members", 1)
     test.add(difference)
     parts = [difference[i::members] for i in range(members)]
-    kept = test.decision == "better" and not any(map(_clearly_worse, parts))
+    worse = any(x.mean() > 2 * x.std() / math.sqrt(len(x)) or x.mean() == math.inf for x in parts)
+    kept = test.decision == "better" and not worse
     if not kept:
         mpc.load_state_dict(before)
     ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
     return Improvement(kept, *ends, sum(bool(x.mean() < 0) for x in parts), members)
-
-
-def _clearly_worse(difference: Tensor) -> bool:
-    """Return True if the mean of differences is above zero by twice its standard error."""
-    error = difference.std() / math.sqrt(len(difference))
-    return bool(difference.mean() > 2 * error) or not bool(difference.mean() < torch.inf)
 
 
 class Descent:
@@ -539,22 +551,13 @@ class Descent:
 
     Each entry of theta's coordinates has the unit that the signals of the first loops give it, in
     which ``optimizer`` works. Arguments are as in `improve`.
-
-    Raises:
-        QPError: ``mpc`` learns nothing.
     """
 
     def __init__(
-        self,
-        mpc: QPMPC,
-        plant: Any,
-        loops: int,
-        steps: int,
-        rate: float,
-        window: int | None = None,
+        self, mpc: QPMPC, plant: Any, loops: int, steps: int, window: int, rate: float, seed: int
     ) -> None:
-        self._mpc, self._loops, self._steps = mpc, _Loops(plant, loops, 0), steps
-        self._window = steps if window is None else window
+        self._mpc, self._loops = mpc, _Loops(plant, loops, 0)
+        self._steps, self._window = steps, window
         leaves = {k: x for k, x in mpc.coordinates().items() if x.requires_grad and x.is_leaf}
         if not leaves:
             remedy = "Name parts of theta in its learn."
@@ -572,9 +575,6 @@ class Descent:
         self._units = [_unit(mpc, name, x, units.get(name)) for name, x in leaves.items()]
         self._moves = [torch.zeros_like(x) for x in self._leaves]
         self.optimizer = torch.optim.Adam(self._moves, lr=rate)
-
-    def start(self, seed: int) -> None:
-        """Begin new loops, with first states and noise of a seed."""
         self._loops.start(seed)
 
     def update(self, penalty: Callable[[QPMPC], Tensor] | None = None) -> Tensor:
