@@ -37,7 +37,7 @@ BUDGET = {
     "export": 1500,
     "learning": 2842,  # models that did not train theta decide in improve
     "identification": 2633,
-    "mpc": 3880,
+    "mpc": 3895,
     "proofs": 1001,
     "qp": 5859,
     "study": 587,  # load_run(..).predict, which refinement's second start pays for

@@ -88,6 +88,8 @@ def test_from_data_fits_the_cost_to_the_rewards(hessian):
     assert_close(H.detach(), weight, rtol=1e-6, atol=1e-6)
     assert_close(H_f.detach(), weight[:2], rtol=1e-6, atol=1e-6)
     assert_close(mpc.q[-2:].detach(), torch.tensor([1.0, 0.0]).double(), rtol=1e-6, atol=1e-6)
+    absent = QPMPC.from_data(log, 3, hessian=hessian, gamma=0.8, learn=("H", "H_f", "q"), q=None)
+    assert_close(absent.q, mpc.q)
     own = QPMPC.from_data(log, 3, stage_weight=[1.0, 1.0, 0.1])
     assert own.H.tolist() == [1.0, 1.0, 0.1]
     assert (own.q == 0).all()

@@ -138,6 +138,24 @@ def test_gradients_of_the_value_are_finite_differences():
             assert gradient.view(-1)[k].item() == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
+def test_actions_are_levels_to_the_last_bit_and_a_batch_may_be_empty():
+    levels = {"action_levels": [(-0.3, 0.0, 0.7)], "solver": "daqp"}
+    mpc = qm.QPMPC.from_model([[0.9]], [[0.5]], 4, stage_weight=[1.0, 0.1], **levels)
+    s = torch.linspace(-3, 3, 101).double()[:, None]
+    u = mpc.policy(s)
+    assert {*u.flatten().tolist()} == {-0.3, 0.0, 0.7}
+    assert mpc.value(s[:0]).shape == (0,)
+    assert mpc.predict(s[:0]).shape == (0, 1)
+
+
+def test_the_only_level_is_feasible_in_single_precision():
+    levels = {"action_levels": [(0.1,)], "solver": "daqp"}
+    mpc = qm.QPMPC.from_model([[0.9]], [[0.5]], 2, stage_weight=[1.0, 0.1], **levels)
+    assert mpc.action_value(torch.ones(1), torch.tensor([0.1])).isfinite()
+    with pytest.raises(qm.SolverError, match="INFEASIBLE"):
+        mpc.action_value(torch.ones(1), torch.tensor([0.2]))
+
+
 def test_relaxed_stages_and_continuous_actions_cost_less_and_keep_the_levels_of_the_others():
     full, short = of(), of(integer_horizon=2)
     s = torch.tensor([[1.3], [-2.6], [0.2]], dtype=torch.float64)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -592,6 +593,14 @@ def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
     value[index] = 0.5
     with pytest.raises(QPError, match=rf"{part}: got entries .* Call release\(\) first"):
         setattr(mpc, part, value)
+
+
+@pytest.mark.parametrize("kind", [">f8", "g", "f4", "i8"])
+def test_predict_takes_any_array_of_numbers(kind):
+    mpc = QPMPC.from_model([[0.9]], [[0.5]], 3, stage_weight=[1.0, 0.1], solver="daqp")
+    s = np.array([[1.0], [2.0], [-3.0]])
+    given = mpc.predict(s[::-1].astype(kind)[::-1])
+    np.testing.assert_allclose(given, mpc.predict(s), rtol=1e-6)
 
 
 def test_the_plan_that_is_predicted_has_the_size_of_z():

@@ -253,6 +253,53 @@ def test_real_time_iteration_swings_a_pendulum_up():
     assert (x[:, 1].abs() < 0.1).all()
 
 
+def bent(x: Tensor, u: Tensor) -> Tensor:
+    return x + 0.1 * u.sum(-1, keepdim=True) - 0.6 + 0.3 * torch.sin(3 * x)
+
+
+ONE_SIDED = ([5.0], [torch.inf]), ([-torch.inf], [-5.0]), ([-20.0], [-15.0]), ([-1.0], [1.0])
+
+
+@pytest.mark.parametrize("iterations", [1, 30])
+@pytest.mark.parametrize(("low", "high"), ONE_SIDED)
+def test_actions_are_within_hard_bounds_whatever_the_plan_was(low, high, iterations):
+    bounds = {"action_bounds": (low, high), "iterations": iterations, "solver": "daqp"}
+    mpc = QPMPC.of(1, 1, 5, dynamics=bent, stage_weight=[1.0, 0.1], **bounds)
+    s = torch.linspace(-8, 8, 33).double()[:, None]
+    for plan in (None, torch.full((33, 5, 1), 9.0).double()):
+        solution = mpc.solve(s, warm_start=plan)
+        assert solution.solved.all()
+        u = solution.plan[solution.solved]
+        assert (u >= low[0] - 1e-6).all()
+        assert (u <= high[0] + 1e-6).all()
+
+
+def test_actions_satisfy_hard_rows_of_several_actions():
+    rows = {"constraints": ([[0.0, 1.0, 1.0]], [-torch.inf], [-3.0]), "solver": "daqp"}
+    mpc = QPMPC.of(1, 2, 5, dynamics=bent, stage_weight=[1.0, 0.1, 0.1], **rows)
+    s = torch.linspace(-8, 8, 33).double()[:, None]
+    assert (mpc.policy(s).sum(-1) <= -3 + 1e-6).all()
+
+
+def test_a_batch_may_have_its_own_prices_or_no_states():
+    bounds = {"action_bounds": ([-1.0], [1.0]), "state_bounds": ([-2.0], [2.0])}
+    options = {"stage_weight": [1.0, 0.1], "learn": ("c", "w"), "solver": "daqp"}
+    mpc = QPMPC.of(1, 1, 5, dynamics=bent, **bounds, **options)
+    s = torch.linspace(-8, 8, 9).double()[:, None]
+    own = torch.zeros(9, *mpc.coordinates()["w"].shape).double()  # plans end one after the other
+    assert_close(mpc.value(s, mpc.quadratic_program({"w": own})), mpc.value(s), rtol=1e-5, atol=0)
+    assert mpc.value(s[:0]).shape == (0,)
+    assert mpc.predict(s[:0]).shape == (0, 1)
+
+
+def test_a_module_may_have_attributes_of_any_name():
+    dynamics = Pendulum()
+    dynamics.arguments = {"gravity": 2.0}
+    mpc = QPMPC.of(2, 1, 3, dynamics=dynamics, stage_weight=[1.0, 1.0, 0.1])
+    mpc.reset_parameters()
+    assert copy.deepcopy(mpc).sequential.dynamics.arguments == {"gravity": 2.0}
+
+
 def test_q_learning_moves_the_parameters_of_the_dynamics():
     mpc = made(iterations=20, on_failure="mask")
     loss = QPQLearningLoss(QPActorValueOperator(mpc), delay_value=True)

@@ -48,6 +48,7 @@ class Levels:
     Attributes:
         actions: the places of the actions in u, ``(m,)``.
         rows: the row of G that each decision holds, ``(m, S)``.
+        entries: the entry of z that is the decision, ``(m, S)``; None if rows hold sums of several.
         values: ascending levels, ``(m, L)``; the highest one fills the row.
         rules: the fewest steps off and on, ``(m, 2)``.
         starts: the costs of going on, ``(m, S)``.
@@ -56,6 +57,7 @@ class Levels:
 
     actions: np.ndarray
     rows: np.ndarray
+    entries: np.ndarray | None
     values: np.ndarray
     rules: np.ndarray
     starts: np.ndarray
@@ -91,6 +93,7 @@ class Levels:
         if own is not None:
             rows = (mixed + k * layout.n_mixed + own[a] for a in actions)
         rows = np.stack([*rows])
+        entries = rows + (layout.n_p - layout.n_x) if own is None else None
         if not scheme.theta["w"][rows].isinf().all():
             remedy = "Leave action_slack out, or inf for these actions."
             want = "hard bounds of actions on levels"
@@ -102,7 +105,7 @@ class Levels:
                 check_whole(name, float(x) if x % 1 else int(x), 1)
         rules = np.stack((off, on), -1).astype(np.int64)
         starts = cost[:, None] * scheme.gamma ** np.arange(S)
-        return cls(actions, rows, values, rules, starts, bounds.max_nodes)
+        return cls(actions, rows, entries, values, rules, starts, bounds.max_nodes)
 
     @property
     def identity(self) -> list[Any]:
@@ -134,8 +137,9 @@ class Levels:
             )
         found = places[:, 0, 0] >= 0
         free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
-        best = self.held(qp, np.where(free, places, -1), batch)
-        start = torch.from_numpy(active).reshape(*batch, -1).to(qp.lb.device)
+        places = np.where(free, places, -1)
+        best = self.held(qp, places, batch)
+        start = torch.from_numpy(active).reshape(*batch, active.shape[1]).to(qp.lb.device)
         solution = solve(best, fixed, n_kept, solver, "mask", start)
         status = solution.status.reshape(-1).cpu().numpy().copy()
         status = np.where((status == 0) | ~found, STATUSES[outcomes], status)
@@ -152,6 +156,12 @@ class Levels:
         of_starts = torch.from_numpy(costs).reshape(batch).to(to, qp.q.dtype)
         value = torch.where(lost, torch.inf, solution.value + of_starts)
         known = F.pad(fixed.detach(), (0, qp.n_z - fixed.shape[-1])).expand_as(solution.z)
+        z = solution.z.clone()
+        if self.entries is not None:  # a level to the last bit
+            decided = torch.from_numpy(places >= 0).reshape(*batch, *self.rows.shape).to(to)
+            z[..., self.entries] = (
+                best.lb[..., self.rows].to(z).where(decided, z[..., self.entries])
+            )
         parts = {name: getattr(solution, name) for name in ("chi", "lam", "xi")}
         parts = {name: torch.where(lost[..., None], 0.0, x) for name, x in parts.items()}
         gap = torch.from_numpy(np.where(capped, gaps, 0.0)).reshape(batch).to(to, qp.q.dtype)
@@ -159,7 +169,7 @@ class Levels:
             solution,
             **parts,
             qp=best,
-            z=torch.where(lost[..., None], known.to(qp.q.dtype), solution.z),
+            z=torch.where(lost[..., None], known.to(qp.q.dtype), z),
             active=solution.active.masked_fill(lost[..., None], UNKNOWN),
             value=value,
             status=torch.from_numpy(status).reshape(batch).to(to),
@@ -216,7 +226,8 @@ class Levels:
         rows = place[self.rows]
         given = self.rows[rows < 0]  # those of u_0 in Q, whose level is known
         known = np.einsum("bri,bi->br", theta.G[group][:, given, :n_f], programs.fixed)
-        near = ON_LEVEL * np.ptp(self.values, axis=-1)[(rows < 0).any(-1)]
+        span = np.ptp(self.values, axis=-1)
+        near = ON_LEVEL * np.where(span > 0, span, np.abs(self.values[:, 0]))[(rows < 0).any(-1)]
         lb, ub = (
             np.array(np.broadcast_to(x, (len(group), x.shape[1]))) for x in (theta.lb, theta.ub)
         )

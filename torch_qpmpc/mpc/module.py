@@ -20,6 +20,7 @@ from torch_qpmpc.checks import check_choice, check_kind, check_tensor, ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.identification.identification import measured_model, model_arguments
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
@@ -273,7 +274,8 @@ class QPMPC(nn.Module):
             arguments["stage_weight"] = cost.stage_weight
             if arguments.get("terminal_weight") is None:
                 arguments["terminal_weight"] = cost.terminal_weight
-            arguments = {"q": cost.q, "c": cost.c} | arguments
+            given = {name: x for name, x in arguments.items() if x is not None}
+            arguments = {"q": cost.q, "c": cost.c} | given
         return cls.of(**arguments)
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
@@ -332,7 +334,8 @@ class QPMPC(nn.Module):
             observation = observation.detach().cpu()
         try:
             x = np.asarray(observation)
-            x = x if x.dtype.kind == "f" else torch.as_tensor(x).double().numpy()
+            kind = x.dtype if x.dtype in (np.float16, np.float32) else np.float64
+            x = np.ascontiguousarray(x, kind)
         except (TypeError, ValueError) as error:
             got, want = type(observation).__name__, f"an array of shape (.., {self.n_p})"
             remedy = "Pass the observation alone; env.reset and env.step return more."
@@ -592,7 +595,8 @@ class QPMPC(nn.Module):
         options = {"learn": learn, **{name: str(getattr(self, name)) for name in names}}
         if self.sequential is not None:
             dynamics = self.sequential.dynamics
-            options["dynamics"] = getattr(dynamics, "arguments", dynamics)
+            learned = isinstance(dynamics, LearnedModel)
+            options["dynamics"] = dynamics.arguments if learned else dynamics
             options["iterations"] = self.sequential.iterations
         return options
 

@@ -294,14 +294,17 @@ class SequentialQP(nn.Module):
         layout, B, every = self.layout, len(fixed), torch.arange(len(fixed))
         n_p, n, N, p = layout.n_p, layout.n, layout.horizon, fixed[:, : layout.n_p]
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
-        hard = qp.w.isinf() & (qp.G[..., of_x] != 0).any(-1)  # no plan violates those of u alone
+        hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G[..., of_x] != 0).any(-1)))
+        of_u, hard = hard & ~moved, hard & moved  # those of u alone no plan may violate
         price = torch.where(qp.w.isinf(), 1.0, qp.w).expand(B, -1).clone()
 
         def merit(index: Tensor, z: Tensor, costs: Tensor) -> Tensor:
             """Return the cost of z ``(len(index), K, n_z)`` with the prices of violations."""
             own = _taken(qp, index, 1)
             y = times(own.G, z)
-            over = price[index].unsqueeze(1) * torch.maximum(own.lb - y, y - own.ub).relu()
+            over = torch.maximum(own.lb - y, y - own.ub).relu()
+            far = (over > ROUNDING**0.5) & of_u[index].unsqueeze(1)
+            over = (price[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
             costs = costs + over.sum(-1) + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
             return costs.nan_to_num(torch.inf, torch.inf, torch.inf)
 
@@ -316,7 +319,7 @@ class SequentialQP(nn.Module):
         pull, parts = fixed.new_full((B,), FIRST), []
         converged, done = torch.zeros(2, B, dtype=torch.bool)
         for _ in range(self.iterations):
-            if not len(todo := (~done).nonzero().squeeze(1)):
+            if not len(todo := (~done).nonzero().squeeze(1)) and parts:
                 break
             near = self.along(_taken(qp, todo), z[todo])
             size = near.H.diagonal(dim1=1, dim2=2)
@@ -330,7 +333,7 @@ class SequentialQP(nn.Module):
             for part, x in zip(parts, own, strict=True):
                 part[todo] = x
             solved, among = solution.solved, torch.arange(len(todo))
-            lam = torch.where(hard & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
+            lam = torch.where(hard[todo] & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
             price[todo] = price[todo].maximum(lam)
             step = (layout.predicted(solution.z)[1] - u[todo]) * solved[:, None, None]
             tries = torch.stack([u[todo] + share * step for share in FRACTIONS], 1)
@@ -352,11 +355,12 @@ class SequentialQP(nn.Module):
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:
         """Return plans ``(.., K, N, n_u)``, held at zero and random within the bounds."""
-        N, sides = self.layout.horizon, []
-        for side, none in ((qp.lb, -1.0), (qp.ub, 1.0)):
-            rows = side[..., : N * self.layout.n].unflatten(-1, (N, -1))[..., self.layout.n_x :]
-            sides.append(torch.where(rows.isfinite(), rows, none).unsqueeze(-3))
-        generator, low, high = torch.Generator().manual_seed(0), sides[0], sides[1]
+        N, n_x, n = self.layout.horizon, self.layout.n_x, self.layout.n
+        sides = (x[..., : N * n].unflatten(-1, (N, -1))[..., n_x:] for x in (qp.lb, qp.ub))
+        low, high = (x.unsqueeze(-3) for x in sides)
+        low = torch.where(low.isfinite(), low, high.where(high.isfinite(), 1.0) - 2)
+        high = torch.where(high.isfinite(), high, low + 2)
+        generator = torch.Generator().manual_seed(0)
         share = torch.rand(RANDOM, -(-N // HOLD), self.layout.n_u, generator=generator)
         share = share.repeat_interleave(HOLD, 1)[:, :N].to(low)
         return torch.cat((torch.zeros_like(low).clamp(low, high), low + share * (high - low)), -3)
