@@ -131,6 +131,8 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
     assert report.after < 0.9 * report.before
     assert len(report.curve) == 8
     assert not all(torch.equal(before[k], x) for k, x in controller.mpc.plan.state_dict().items())
+    with pytest.raises(QPError, match="NaN"):
+        controller.mpc.target([np.nan], known=[0.0, 1.0, 21.0])
     assert np.array_equal(controller.u, u)
     now = {"d": 0.0, "price": 1.0, "top": 21.0}
     assert 0 <= controller.step(y={"T": 20.5}, r={"T": 20.9}, known=now)["q"] <= 10

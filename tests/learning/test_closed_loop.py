@@ -169,7 +169,7 @@ def test_pieces_of_a_single_trajectory_make_an_ensemble(seed):
     assert len(ensemble(logged(1, 15), 8, seed)) == 8  # of whatever pieces
 
 
-def test_what_is_no_better_leaves_theta_as_it_was():
+def test_what_is_no_better_or_stopped_leaves_theta_as_it_was():
     plant = PointMass()
     weight = torch.tensor([1.0] * 4 + [0.1] * 2)
     bounds = ([-1.0] * 2, [1.0] * 2)
@@ -179,6 +179,19 @@ def test_what_is_no_better_leaves_theta_as_it_was():
     assert not report.kept
     assert "not kept, theta is as before" in str(report)
     assert all(torch.equal(before[name], x) for name, x in mpc.named_parameters())
+    moved = []
+
+    def stopped(mpc: qm.QPMPC) -> torch.Tensor:
+        moved.append(any(not torch.equal(before[name], x) for name, x in mpc.named_parameters()))
+        if len(moved) == 3:
+            raise KeyboardInterrupt
+        return torch.zeros(())
+
+    with pytest.raises(KeyboardInterrupt):
+        qm.improve(mpc, plant, updates=9, loops=2, steps=5, held_out=16, penalty=stopped)
+    assert moved == [False, True, True]
+    assert all(torch.equal(before[name], x) for name, x in mpc.named_parameters())
+    assert mpc.on_failure == "raise"
 
 
 def test_loops_go_on_where_the_last_window_ended(found):
@@ -206,6 +219,10 @@ def test_the_stage_cost_is_the_schemes_with_the_price_of_violations():
     assert cost.item() == pytest.approx(9.0 + 0.5 + 3.0 + 20.0)
 
 
+class ManyModels(PointMass):
+    members = 9
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -217,6 +234,7 @@ def test_the_stage_cost_is_the_schemes_with_the_price_of_violations():
         ({"window": 0}, "window: got 0"),
         ({"members": 0}, "members: got 0"),
         ({"held_out": 8}, "held_out: got 8"),
+        ({"plant": ManyModels(), "held_out": 16}, "held_out: got 16, .* whole number >= 18"),
         ({"rate": 0.0}, "rate: got 0.0"),
         ({"seed": -1}, "seed: got -1"),
     ],

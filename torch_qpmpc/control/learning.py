@@ -328,8 +328,8 @@ class ControlledPlant(SimulatedPlant):
         ends = own.L, own.S, own.at_rest(u, d, y), np.zeros_like(own.F)
         observer = Innovations(own.F, own.G, own.E, own.offset, own.H, *ends)
         super().__init__(models, observer, log.trajectories, self.cost, law.design.horizon)
-        self._mpc, self._design, self._from_log = law.mpc, law.design, True
-        law.mpc.targets.on_failure = "mask"
+        self._mpc, self._design, self._from_log = copy.deepcopy(law.mpc), law.design, True
+        self._mpc.targets.on_failure = "mask"
         self._levels = [*map(torch.as_tensor, (middle, size, *law.design.y_bounds))]
         inside = (self._y.clamp(*self._levels[2:]) == self._y).all(-1)
         self._rows = self._rows[inside | ~inside.any()]

@@ -476,7 +476,7 @@ def improve(
         loops, steps: the number of loops side by side, and their length.
         window: steps of one gradient, after which the loops go on; ``steps`` by default.
         rate: the first rate of Adam, in units of the signals.
-        held_out: the number of loops that decide.
+        held_out: the number of loops that decide, at least two with each model.
         members: the number of models of an identified plant: the log's, and others of trajectories
             drawn with replacement, or of pieces of a single one.
         cost: maps p ``(count, n_p)`` and u ``(count, n_u)`` to the costs of a step of an identified
@@ -505,7 +505,6 @@ def improve(
     own = {"updates": updates, "loops": loops, "steps": steps, "window": window, "members": members}
     for name, size in own.items():
         check_whole(name, size, 1)
-    check_whole("held_out", held_out, FEWEST)
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
     if isinstance(plant, Identified):
@@ -517,11 +516,13 @@ def improve(
     seeds = [int(x) for x in np.random.SeedSequence(seed).generate_state(2)]
     before, on_failure = copy.deepcopy(mpc.state_dict()), mpc.on_failure
     unseen, longer = getattr(plant, "unseen", plant), LONGER * steps
+    members = getattr(unseen, "members", 1)
+    check_whole("held_out", held_out, max(FEWEST, 2 * members))
 
     def tried() -> Tensor:
         return _Loops(unseen, held_out, seeds[0]).run(mpc, longer).costs.mean(0)
 
-    mpc.on_failure, curve = "mask", []
+    mpc.on_failure, curve, kept = "mask", [], False
     try:
         old = tried()
         descent = Descent(mpc, plant, loops, steps, window, rate, seeds[1])
@@ -529,19 +530,18 @@ def improve(
         for _ in range(updates):
             curve.append(descent.update(penalty).item())
             schedule.step()
-        new = tried()
+        old, new = (x.nan_to_num(torch.inf, torch.inf) for x in (old, tried()))
+        difference = (new - old).nan_to_num(0.0, torch.inf, -torch.inf)  # where both fail they tie
+        test = PairedTest()
+        test.add(difference)
+        parts = [difference[i::members] for i in range(members)]
+        worse = any(x.mean() > 2 * x.std().nan_to_num() / math.sqrt(len(x)) for x in parts)
+        kept = test.decision == "better" and not worse
     finally:
         mpc.on_failure = on_failure
         mpc.zero_grad()
-    old, new = (x.nan_to_num(torch.inf, torch.inf) for x in (old, new))
-    difference = (new - old).nan_to_num(0.0, torch.inf, -torch.inf)  # where both fail they tie
-    test, members = PairedTest(), getattr(unseen, "members", 1)
-    test.add(difference)
-    parts = [difference[i::members] for i in range(members)]
-    worse = any(x.mean() > 2 * x.std() / math.sqrt(len(x)) or x.mean() == math.inf for x in parts)
-    kept = test.decision == "better" and not worse
-    if not kept:
-        mpc.load_state_dict(before)
+        if not kept:
+            mpc.load_state_dict(before)
     ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
     return Improvement(kept, *ends, sum(bool(x.mean() < 0) for x in parts), members)
 
