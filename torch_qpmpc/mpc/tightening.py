@@ -62,10 +62,8 @@ def tighten(
     n_x, n_u, N = mpc.n_x, mpc.n_u, mpc.horizon
     check_tensor("covariances", covariances, N + 1, n_x, n_x, batched=False)
     if not covariances.isfinite().all():
-        remedy = "Shorten the horizon, or pass those of A + B K."
-        raise QPError.expected("covariances", "NaN or inf", "finite entries", remedy)
-    valid = "a probability in [0.5, 1)"
-    check_number("probability", probability, lambda x: 0.5 <= x < 1, valid)
+        raise QPError.expected("covariances", "NaN or inf", "finite entries")
+    check_number("probability", probability, lambda x: 0.5 <= x < 1, "a probability in [0.5, 1)")
     if learned := {"lb", "ub"} & {*mpc.learned}:
         got = f"one that learns {' and '.join(sorted(learned))}"
         raise QPError.expected("mpc", got, "fixed bounds", "Leave lb and ub out of learn.")
