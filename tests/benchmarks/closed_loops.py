@@ -36,7 +36,7 @@ from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "closed_loops.csv"
 SEEDS = (1, 2, 3, 4, 5)
@@ -215,8 +215,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
             rows.to_csv(options.results, index=False, float_format="%.6g")
             print(*row.values(), flush=True)
-    text = options.page.read_text(encoding="utf-8")
-    options.page.write_text(replaced(text, shown(rows), "closed-loops"), encoding="utf-8")
+    write_section(options.page, shown(rows), "closed-loops")
 
 
 def shown(rows: Any) -> str:

@@ -26,7 +26,7 @@ from tests.campaign.exports import PROBLEMS
 from torch_qpmpc import QPMPC, CompiledPolicy, export_c
 from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.export.library import required_compiler
-from torch_qpmpc.study.markdown import replaced
+from torch_qpmpc.study.markdown import write_section
 
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "benchmarks.md"
@@ -140,8 +140,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.write:
         lines = [titles, ["---", "---", *["---:"] * 3], *rows]
         table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(text, table, "export"), encoding="utf-8")
+        write_section(PAGE, table, "export")
     return 0
 
 

@@ -31,7 +31,7 @@ from tests.benchmarks.peers import moreau
 from tests.benchmarks.problems import PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
 from tests.benchmarks.table import significant
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 GPU = torch.device("cuda")
@@ -217,8 +217,7 @@ def main(arguments: list[str]) -> None:
     text = report(GPU)
     print(text)
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, text, "gpu"), encoding="utf-8")
+        write_section(PAGE, text, "gpu")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from gymnasium.spaces import Box
 import torch_qpmpc as qm
 from tests.benchmarks import outside
 from tests.benchmarks.table import significant
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 HERE = "tests.benchmarks.guide"
 HORIZON, ACTIONS, EPISODES, DELAY = 20, 4_000, 32, 5
@@ -143,8 +143,7 @@ def main() -> None:
     text = table(HEAD, lines)
     print(text)
     if options.write:
-        page = outside.PAGE.read_text(encoding="utf-8")
-        outside.PAGE.write_text(replaced(page, text, "guide"), encoding="utf-8")
+        write_section(outside.PAGE, text, "guide")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import find_task, make_physics
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = (DOCS / "results" / f"improvement.{end}" for end in ("md", "csv"))
 #: Seeds of the runs, and of the evaluation.
@@ -141,8 +141,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
     parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(None if arguments is None else list(arguments))
-    text = options.page.read_text(encoding="utf-8")
-    replaced(text, "", "improvement")  # fail before the runs
     torch.set_num_threads(1)
     rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
     done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
@@ -151,8 +149,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
             rows.to_csv(options.results, index=False, float_format="%.6g")
             print(*row.values(), flush=True)
-    text = replaced(text, comparison(rows), "improvement")
-    options.page.write_text(text, encoding="utf-8")
+    write_section(options.page, comparison(rows), "improvement")
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ from tests.benchmarks.improvement import PAGE
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.envs.linear_system import LinearSystem, normal, uniform
 from torch_qpmpc.export.library import required_compiler
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 #: Seconds of a step, the soft bounds, limits of forces and moves, and the price of a violation.
 DT, BOUND, FORCE, MOVE, PRICE = 0.15, 0.35, 1.0, 0.2, 20.0
@@ -285,8 +285,7 @@ def main() -> None:
     text = table(head, rows)
     print(text)
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, text, "micro-controller"), encoding="utf-8")
+        write_section(PAGE, text, "micro-controller")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from tests.benchmarks.solvers import PAGE
 from tests.benchmarks.table import significant
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers.daqp import NO_BOUND, RECIPROCAL_RHO, SOFT
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 STEPS, FEW, BLOCK, KICK, PASSES = 10_000, 200, 200, 50, 3
 SIZES = {"N = 10, 2 states": (10, 2, 1), "N = 50, 8 states": (50, 8, 2)}
@@ -226,8 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     print(text)
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, text, "one state"), encoding="utf-8")
+        write_section(PAGE, text, "one state")
     return 0
 
 

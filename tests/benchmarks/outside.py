@@ -48,7 +48,7 @@ from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = DOCS / "results" / "outside.md"
 RESULTS = DOCS / "results" / "outside.csv"
@@ -551,9 +551,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
                 add(options.results, row | (new := learned(name, seed, row["start"])))
                 print(name, seed, *new.values(), flush=True)
     rows: Any = pd.read_csv(options.results)
-    text = options.page.read_text(encoding="utf-8")
     tables = [outcomes(rows), learning(rows)] if rows["learned"].notna().any() else [outcomes(rows)]
-    options.page.write_text(replaced(text, "\n\n".join(tables), "starts"), encoding="utf-8")
+    write_section(options.page, "\n\n".join(tables), "starts")
 
 
 if __name__ == "__main__":

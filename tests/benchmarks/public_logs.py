@@ -23,7 +23,7 @@ import numpy as np
 import pandas as pd
 
 import torch_qpmpc as qm
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "outside.md"
 ROWS, SPLITS, CHOOSING, AHEAD, SETTLED = 2000, (0.5, 0.6, 0.7), 0.3, 20, 20
@@ -145,8 +145,7 @@ def main() -> None:
     print(f"median {np.median(ratios):.2f}, largest {max(ratios):.2f}")
     head = ["", "`identify`", "ARX", "ratio"]
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, table(head, lines), "logs"), encoding="utf-8")
+        write_section(PAGE, table(head, lines), "logs")
 
 
 if __name__ == "__main__":

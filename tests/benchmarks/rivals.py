@@ -50,7 +50,7 @@ from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
 from torch_qpmpc.experiment.tasks import Task, plant_layout, register
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "rivals.csv"
 SIZES, SEEDS, EVALUATION = (500, 2000, 10_000, 20_000), range(1001, 1021), 50_000
@@ -414,8 +414,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
             rows = pd.concat([rows, pd.DataFrame([*run(*key)])])
             rows.to_csv(options.results, index=False, float_format="%.6g")
             print(rows.tail(8).to_string(header=False, index=False), flush=True)
-    text = options.page.read_text(encoding="utf-8")
-    options.page.write_text(replaced(text, shown(rows), "rivals"), encoding="utf-8")
+    write_section(options.page, shown(rows), "rivals")
     drawn(rows).savefig(options.page.with_name("rivals.png"), dpi=110)
 
 

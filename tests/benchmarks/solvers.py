@@ -34,7 +34,7 @@ from tests.benchmarks.table import significant
 from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 #: QPs in our batches, in the others' loops, and compared with the reference.
@@ -189,8 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     print(text)
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, text, "solvers"), encoding="utf-8")
+        write_section(PAGE, text, "solvers")
     return 0
 
 

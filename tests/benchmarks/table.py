@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -32,10 +32,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="format these results instead of running")
     parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(arguments)
-    page = options.page.read_text(encoding="utf-8")
-    replaced(page, "", "benchmark")  # fail before the runs, which take minutes
     results = json.loads((options.json or run()).read_text(encoding="utf-8"))
-    options.page.write_text(replaced(page, tables(results), "benchmark"), encoding="utf-8")
+    write_section(options.page, tables(results), "benchmark")
 
 
 def run() -> Path:

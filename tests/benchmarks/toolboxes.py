@@ -22,7 +22,7 @@ import numpy as np
 
 import torch_qpmpc as qm
 from tests.benchmarks.table import DOCS
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 Q, R, N = np.eye(2), 0.1 * np.eye(1), 30
@@ -171,7 +171,7 @@ def main(write: bool) -> None:
     print(text)
     if write:
         page = DOCS / "results" / "conventions.md"
-        page.write_text(replaced(page.read_text("utf-8"), text, "toolboxes"), "utf-8")
+        write_section(page, text, "toolboxes")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import torch_qpmpc as qm
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 KINDS = ("normal", "heavy-tailed", "coloured")
 SHARES = (None, 0.2, 0.05, 0.01)
@@ -85,8 +85,7 @@ def main() -> None:
     text = rates(options.seeds, options.steps)
     print(text)
     if options.write:
-        page = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(replaced(page, text, "violation"), encoding="utf-8")
+        write_section(PAGE, text, "violation")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from tests.benchmarks.table import DOCS, ROOT, replaced, table
+from tests.benchmarks.table import DOCS, ROOT, table, write_section
 from tests.campaign.families import FAMILIES, Draw
 from tests.campaign.tally import SLOW, Tally
 from torch_qpmpc.qp.solvers import BACKENDS
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     for marker, text in parts.items():
         print(text, end="\n\n")
         if options.write:
-            PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), text, marker), "utf-8")
+            write_section(PAGE, text, marker)
     return int(any(tally.failures for of_one in tallies.values() for tally in of_one.values()))
 
 

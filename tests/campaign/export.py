@@ -20,7 +20,7 @@ from torch_qpmpc import export_c
 from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.qp.program import Status as Outcome
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability" / "measured.md"
 #: The bounds on differences of actions, and of values relative to 1 + |V|.
@@ -112,7 +112,7 @@ def write(row: list[str]) -> None:
     rows = [line.strip("| ").split(" | ") for line in old.strip().splitlines()[2:]]
     found = {cells[0]: cells for cells in rows} | {row[0]: row}
     ordered = [found[name] for name in PROBLEMS if name in found]
-    PAGE.write_text(replaced(text, table(TITLES, ordered), "export"), encoding="utf-8")
+    write_section(PAGE, table(TITLES, ordered), "export")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tests.benchmarks.table import DOCS, replaced, table
+from tests.benchmarks.table import DOCS, table, write_section
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.program import TOLERANCE
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
     text = table(["largest relative error", *options.solver], lines)
     print(text)
     if options.write:
-        PAGE.write_text(replaced(PAGE.read_text(encoding="utf-8"), text, "numerics"), "utf-8")
+        write_section(PAGE, text, "numerics")
 
 
 def measure(solver: str) -> list[str]:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from torch_qpmpc import QPError
-from torch_qpmpc.study.markdown import replaced, table
+from torch_qpmpc.study.markdown import table, write_section
 
 
 def test_a_table_has_its_numbers_to_the_right():
@@ -15,14 +15,22 @@ def test_a_table_has_its_numbers_to_the_right():
     ]
 
 
-def test_only_text_between_the_markers_changes():
-    text = "before\n<!-- it -->\n\nold\n\n<!-- /it -->\nafter <!-- other -->\n"
-    assert replaced(text, "new", "it") == text.replace("old", "new")
+def test_only_text_between_the_markers_changes(tmp_path):
+    text, page = (
+        "before\n<!-- it -->\n\nold\n\n<!-- /it -->\nafter <!-- other -->\n",
+        tmp_path / "a.md",
+    )
+    page.write_text(text)
+    write_section(page, "new", "it")
+    assert page.read_text() == text.replace("old", "new")
 
 
 @pytest.mark.parametrize(
     "text", ["", "<!-- it -->", "<!-- /it --><!-- it -->", 2 * "<!-- it --><!-- /it -->"]
 )
-def test_missing_markers_are_refused(text):
-    with pytest.raises(QPError, match="expected one line <!-- it --> and below it one line"):
-        replaced(text, "new", "it")
+def test_missing_markers_are_refused(text, tmp_path):
+    page = tmp_path / "a.md"
+    page.write_text(text)
+    message = r"a\.md: got \d and \d, expected one line <!-- it --> and below it one line"
+    with pytest.raises(QPError, match=message):
+        write_section(page, "new", "it")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from torch_qpmpc.errors import QPError, printable
 
@@ -25,12 +26,13 @@ def table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, rule, *lines))
 
 
-def replaced(text: str, new: str, marker: str) -> str:
-    """Replace what ``text`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``."""
+def write_section(page: Path, new: str, marker: str) -> None:
+    """Replace what ``page`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``."""
+    text = page.read_text(encoding="utf-8")
     begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
     counts = text.count(begin), text.count(end)
     if counts != (1, 1) or text.index(begin) > text.index(end):
         expected = f"one line {begin} and below it one line {end}"
-        raise QPError.expected("the page", f"{counts[0]} and {counts[1]}", expected, "Add them.")
+        raise QPError.expected(str(page), f"{counts[0]} and {counts[1]}", expected, "Add them.")
     before, after = text.split(begin)[0], text.split(end)[1]
-    return f"{before}{begin}\n\n{new}\n\n{end}{after}"
+    page.write_text(f"{before}{begin}\n\n{new}\n\n{end}{after}", encoding="utf-8")

@@ -22,7 +22,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.study import plots
-from torch_qpmpc.study.markdown import escaped, replaced, table
+from torch_qpmpc.study.markdown import escaped, table, write_section
 from torch_qpmpc.study.runs import CASES, REAL_GAP, collect
 from torch_qpmpc.study.statistics import interquartile_mean, spread
 
@@ -115,9 +115,9 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
 
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
     """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
-    text, sweeps = page.read_text(encoding="utf-8"), frame.groupby("sweep")
+    sweeps = frame.groupby("sweep")
     tables = [f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in sweeps]
-    page.write_text(replaced(text, "\n\n".join(tables), name), encoding="utf-8")
+    write_section(page, "\n\n".join(tables), name)
     _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
     if len({*first["label"]}) <= SIDE_BY_SIDE:
         plots.meaning_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
