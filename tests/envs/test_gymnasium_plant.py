@@ -136,11 +136,11 @@ def test_unknown_arguments_of_an_environment_are_an_error():
         GymnasiumPlant("Pendulum-v1", weight=2)
 
 
-def test_a_solvers_rounding_reaches_the_plant_as_zero(register):
+def test_actions_are_clipped_and_a_solvers_rounding_is_zero(register):
     env = GymnasiumPlant(register()).make()
     own: Any = env.unwrapped
     env.reset(seed=0)
-    for action, applied in ((1e-10, 0.0), (-0.5, -0.5)):
+    for action, applied in ((1e-10, 0.0), (-0.5, -0.5), (3.0, 2.0), (-3.0, -1.0)):
         env.step(np.array([action], np.float32))
         assert own.action.tolist() == [applied]
         assert own.action.dtype == np.float32

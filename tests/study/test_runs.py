@@ -94,8 +94,8 @@ def test_the_models_error_is_that_of_one_step(study):
 def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
     for name in ("one", "two"):
         shutil.copytree(study / "small" / "gaussian-free-seed1", tmp_path / name)
-        config = tmp_path / name / "config.yaml"
-        config.write_text(config.read_text().replace("ablation: null", f"ablation: {name}"))
+        summary = tmp_path / name / "summary.json"
+        summary.write_text(summary.read_text().replace('ablation": null', f'ablation": "{name}"'))
     assert collect(tmp_path)["label"].tolist() == ["free, one", "free, two"]
 
 

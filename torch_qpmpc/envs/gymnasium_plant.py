@@ -90,12 +90,12 @@ class GymnasiumPlant:
     def make(self, max_steps: int | None = None) -> gymnasium.Env[Any, Any]:
         """Make one environment; ``max_steps`` replaces the length of its episodes.
 
-        Actions smaller than 1e-9 of their bounds become zero, because some plants react to the
-        tiniest one.
+        Actions are clipped to their bounds. Those smaller than 1e-9 of them become zero, because
+        some plants react to the tiniest one.
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
-        rounded = partial(_without_rounding, env.action_space)
-        env = TransformAction(_Guarded(env, self.raised), rounded, None)
+        applied = partial(_applied, env.action_space)
+        env = TransformAction(_Guarded(env, self.raised), applied, None)
         if isinstance(env.observation_space, Dict | Tuple):
             env = FlattenObservation(env)
         return env
@@ -158,8 +158,9 @@ class _Guarded(gymnasium.Wrapper):
         return step
 
 
-def _without_rounding(space: Any, action: np.ndarray) -> np.ndarray:
-    """Return zero for entries of the action that are a solver's rounding."""
-    ends = np.abs((getattr(space, "low", 0.0), getattr(space, "high", 0.0)))
+def _applied(space: Any, action: np.ndarray) -> np.ndarray:
+    """Return the action within its bounds, and zero for entries that are a solver's rounding."""
+    ends = np.abs((space.low, space.high))
     size = np.where(np.isfinite(ends), ends, 0.0).max(0)
-    return np.where(np.abs(action) <= ROUNDING * size, 0, action).astype(action.dtype)
+    applied = np.where(np.abs(action) <= ROUNDING * size, 0, action)
+    return applied.clip(space.low, space.high).astype(action.dtype)

@@ -99,18 +99,17 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
 
 def write(frame: pd.DataFrame, folder: Path) -> str:
     """Write the report into ``folder``; return its tables."""
-    tables, pages = [], []
+    pages = [CAPTION]
     for name, sweep in frame.groupby("sweep"):
         (folder / str(name)).mkdir(parents=True, exist_ok=True)
-        tables.append(f"## {escaped(name)}\n\n{section(sweep)}")
-        pages.append(tables[-1])
+        pages.append(f"## {escaped(name)}\n\n{section(sweep)}")
         for title, figure in figures(sweep):
             # The noise is a name from the folder, which may have slashes.
             file = Path(str(name)) / re.sub(r"[^\w.,=-]+", "_", f"{title}.png")
             figure.savefig(folder / file, dpi=100)
             pages.append(f"![{escaped(title)}]({quote(file.as_posix())})")
-    write_whole(folder / "report.md", "\n\n".join([CAPTION, *pages, ""]).encode())
-    return "\n\n".join([CAPTION, *tables])
+    write_whole(folder / "report.md", "\n\n".join([*pages, ""]).encode())
+    return "\n\n".join(page for page in pages if not page.startswith("!["))
 
 
 def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:

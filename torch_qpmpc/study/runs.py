@@ -193,10 +193,8 @@ def collect(folder: str | Path) -> pd.DataFrame:
     for file in sorted(folder.rglob("summary.json")):
         run = FinishedRun(file.parent)
         where = "." if file.parent == folder else str(file.parent.parent.relative_to(folder))
-        names: dict[str, Any] = {"constraint": run.cfg.constraint.name, "noise": run.cfg.noise.name}
-        names |= {"seed": run.cfg.seed, "ablation": run.cfg.ablation, "run": run}
-        names["sweep"] = folder.resolve().name if where == "." else where
-        rows.append({**run.summary, **names, **run.readings()})
+        sweep = folder.resolve().name if where == "." else where
+        rows.append({**run.summary, "run": run, "sweep": sweep, **run.readings()})
     if not rows:
         got = f"{folder}, without a finished run"
         raise QPError.expected("RUNS_FOLDER", got, "a folder that train.py wrote to")
