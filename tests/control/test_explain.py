@@ -135,3 +135,19 @@ def test_without_a_step_there_is_nothing_to_explain(change):
         QPError, match=r"^controller: got no step since the last change, expected a"
     ):
         made.explain()
+
+
+def test_hard_bounds_without_a_plan_are_named():
+    made = controller(y_bounds={"T": (-1.0, 4.5)}, y_slack={"T": np.inf})
+    made.reset(y=[9.0, 0.0], u=[0.0], known={"d": 1.0, "most": 2.0})
+    made.step([9.0, 0.0], [1.0, 0.0], known=KNOWN)
+    assert made.status.name == "INFEASIBLE"
+    assert "holds T outside the hard bounds. Give T a finite y_slack." in str(made.explain())
+
+
+def test_what_holds_a_free_input_is_said():
+    for R, held in ((0.1, "at rest"), (None, "no R holds it")):
+        mpc = qm.LinearMPC(([[0.9]], [[0.2, 0.1]]), 5, Q=1.0, R=R, dR=0.1, u_target={"u1": 0.5})
+        made = qm.Controller(mpc)
+        made.step([0.0], [1.0])
+        assert f"free: {held} near 0.5" in str(made.explain())

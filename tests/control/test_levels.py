@@ -141,11 +141,18 @@ def test_a_limit_that_is_a_known_signal_holds_with_and_without_a_plan_alike_in_c
         assert u[0] == wanted
 
 
+def test_bounds_are_those_of_the_levels_within_them():
+    """Stages that are not decided on levels, and manual inputs, went up to a bound between two."""
+    controller = qm.Controller(of(u_bounds={"q": (1.0, 9.0)}, min_on=1, min_off=1))
+    assert [side.tolist() for side in controller.mpc.design.u_bounds] == [[4.0], [8.0]]
+
+
 @pytest.mark.parametrize(
     ("options", "match"),
     [
         ({"u_levels": {"p": LEVELS}}, "u_levels: got {'p': .*, expected a mapping from"),
         ({"u_levels": LEVELS}, "u_levels: got .* expected a mapping"),
+        ({"u_levels": {"q": 3}}, "u_levels: got .3., expected for each action ascending"),
         ({"min_on": {"T": 2}}, "min_on: got 'T', expected names among q"),
         ({"u_bounds": {"q": (1.0, 2.0)}}, "u_bounds: got .1, 2. of q"),
         ({"u_levels": None}, "min_on: got {'q': 3}, expected u_levels"),

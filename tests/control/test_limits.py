@@ -40,7 +40,7 @@ def rows(low: Any, cap: Any) -> dict[str, Any]:
 def test_constant_signals_are_constant_bounds(r, options):
     own = plant(**options).mpc
     fixed = {"y_bounds": {"y1": (-1.0, 4.0)}, "u_bounds": {"u1": (-2.0, 0.6), "u2": (-1.5, 1.5)}}
-    slack = own.design.y_slack  # the default follows from numbers alone
+    slack = own.design.slack  # the default follows from numbers alone
     twin = plant(**options, **fixed, y_slack=slack, known=()).mpc
     level, rng = np.array([-1.0, 0.6]), np.random.default_rng(0)
     rows = np.tile(level, (N + 1 if own.design.staged else 1, 1)).squeeze()

@@ -182,6 +182,17 @@ def test_p_takes_batches_and_is_relative_to_the_last_target():
     assert p[0, 48 : 48 + 4].abs().max() < 1e-12
 
 
+def test_a_side_of_bounds_may_be_none():
+    model, inf = (np.diag([0.9, 0.8]), np.eye(2)), np.inf
+    cases = {
+        (None, 3.0): [[-inf, -inf], [3.0, 3.0]],
+        ((None, -1.0), None): [[-inf, -1.0], [inf, inf]],
+    }
+    for bounds, sides in cases.items():
+        design = qm.LinearMPC(model, 3, Q=1.0, u_bounds=bounds).design
+        assert [side.tolist() for side in design.u_bounds] == sides
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -196,7 +207,7 @@ def test_p_takes_batches_and_is_relative_to_the_last_target():
         ({"blocks": 3}, "blocks: got 3, expected whole numbers"),
         ({"references": "later"}, "references: got 'later', expected one of held, preview"),
         ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
-        ({"y_slack": -1.0}, r"y_slack: got \[-1.0\], expected prices >= 0"),
+        ({"y_slack": -1.0}, "y_slack: got {'y1': -1.0}, expected prices >= 0"),
         ({"linear": 1.0}, "linear: got 1.0, expected a mapping from inputs"),
         ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, .* Pass known=.'price'"),
         ({"u_bounds": {"q": (0, 1)}}, "u_bounds: got 'q', expected names among u1"),

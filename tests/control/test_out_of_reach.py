@@ -172,3 +172,14 @@ def test_c_weighs_the_same_set_points_beside_zones():
         assert code == controller.status == 0
         assert np.abs(u - v).max() < 1e-8
         x = plant.A @ x + plant.B @ u + [0.0, 0.05, 0.0, 0.0]
+
+
+def test_zones_alone_rest_where_the_inputs_cost_least():
+    names: Any = {"outputs": ["T", "h"], "inputs": ["p", "q"], "y_bounds": {"T": (1.0, 2.0)}}
+    model = np.diag([0.9, 0.8]), np.array([[0.1, 0.02], [0.01, 0.2]])
+    controller, x = qm.Controller(qm.LinearMPC(model, 10, R=0.01, **names)), np.zeros(2)
+    for _ in range(200):
+        u = controller.step(x)
+        x = model[0] @ x + model[1] @ u + [0.01, 0.0]
+    row = model[1][0]  # row @ u = 0.09 holds T at 1
+    assert np.abs(u - 0.09 * row / (row @ row)).max() < 1e-6

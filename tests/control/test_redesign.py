@@ -115,8 +115,18 @@ def test_weights_of_two_signals_stay_with_both():
 def test_a_price_that_is_not_named_is_the_default():
     """It used to be zero, which left out the bounds of the output."""
     design, default = (made(y_slack=x).mpc.design for x in ({"a": 50.0}, None))
-    assert design.y_slack.tolist() == [50.0, default.y_slack[1]]
+    assert design.slack.tolist() == [50.0, default.slack[1]]
     assert len(design.bounded[0]) == len(design.plant.outputs)
+
+
+def test_default_prices_follow_the_weights_and_bounds():
+    """A bound priced for weights of one gave way to those of 1e6."""
+    controller, new = made(y_slack={"a": 50.0}), {"Q": {"b": 1e6}, "y_bounds": {"b": (0.0, 9.0)}}
+    controller.redesign(**new)
+    merged = {x: {**DESIGN[x], **own} for x, own in new.items()}
+    expected = made(y_slack={"a": 50.0}, **merged).mpc.design.slack
+    assert controller.mpc.design.slack.tolist() == expected.tolist()
+    assert expected[1] > 1e6
 
 
 @pytest.mark.parametrize(

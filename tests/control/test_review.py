@@ -323,3 +323,23 @@ def test_the_margin_is_that_of_the_loop_s_gain():
 
     assert max(map(radius, np.linspace(1 / (1 + margin), 1 / (1 - margin), 50))) < 1
     assert radius(3.0) > 1
+
+
+def test_a_known_signal_without_a_use_is_a_fault():
+    """A forgotten E took away the feedforward without a word."""
+    options = {"known": ["d", "cap", "price"], "E": None, "Q": 1.0, "dR": 0.1}
+    own = {"u_bounds": {"u1": (0.0, "cap")}, "linear": {"u1": "price"}}
+    controller = qm.Controller(qm.LinearMPC(([[0.9]], [[0.5]]), 5, **options, **own))
+    finding = controller.review(r=[1.0], known=[0.0, 1.0, 0.1])["known signals"]
+    assert finding.text == "d moves no state, bounds nothing and is no price."
+    options["E"] = [[0.1, 0.0, 0.0]]
+    controller = qm.Controller(qm.LinearMPC(([[0.9]], [[0.5]]), 5, **options, **own))
+    assert controller.review(r=[1.0], known=[0.0, 1.0, 0.1])["known signals"].ok
+
+
+def test_an_integrator_in_a_zone_alone_is_told_what_would_hold_it():
+    zone = {"Q": {"y2": 1.0}, "dR": 0.1, "y_bounds": {"y1": (-1.0, 1.0)}}
+    mpc = qm.LinearMPC((np.diag([1.0, 0.8]), np.eye(2) / 10), 10, **zone)
+    review = qm.Controller(mpc).review(r=[0.0, 0.0])
+    assert review["stability"].remedy == review["terminal weight"].remedy
+    assert review["stability"].remedy == "Weight an output that shows this mode, by Q."

@@ -97,9 +97,9 @@ def test_violations_cost_their_price():
     run = made(y_bounds=(-0.5, 0.5), y_slack=7.0).simulate(steps=10, r=[0.0], x=[1.0])
     over = np.maximum(run.y[:-1, 0] - 0.5, 0)
     assert over[0] == 0.5
-    free = replace(run, design=replace(run.design, y_slack=np.zeros(1)))
+    free = replace(run, design=replace(run.design, y_slack={"y1": 0.0}))
     assert np.allclose(run.cost - free.cost, 7 * over)
-    hard = replace(run, design=replace(run.design, y_slack=np.full(1, np.inf)))
+    hard = replace(run, design=replace(run.design, y_slack={"y1": np.inf}))
     assert np.array_equal(hard.cost == np.inf, over > 0)
 
 

@@ -83,7 +83,7 @@ def test_the_default_price_of_a_violation_is_a_thousand_stages_in_any_unit(y, u,
     def price(**options):
         bounds: Any = {"y_bounds": (-2 * y, 2 * y), "u_bounds": (-3 * u, 3 * u), **options}
         weights = {"R": 0.1 * cost / u**2, **options}
-        return qm.LinearMPC(([[0.9]], [[0.5 * y / u]]), 5, **{**bounds, **weights}).design.y_slack
+        return qm.LinearMPC(([[0.9]], [[0.5 * y / u]]), 5, **{**bounds, **weights}).design.slack
 
     assert np.allclose(price(Q=cost / y**2), 1e3 * (4 + 0.9) / 2 * cost / y)
     linear = {"linear": {"u1": 7 * cost / u}, "R": None}

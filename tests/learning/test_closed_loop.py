@@ -132,16 +132,23 @@ def test_half_of_the_models_trains_and_the_other_half_decides(found):
     before, cost, calls = copy.deepcopy(mpc.state_dict()), plant.unseen._cost, []
 
     def dearer(p: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
-        """Costs 100 less with the first model, and 10 more with the second one, after it moved."""
+        """Costs so much more in each loop, after theta has moved."""
         calls.append(len(p))
-        change = torch.tensor([-100.0, 10.0]).double().repeat(len(p) // 2)
         return cost(p, a) + change * (len(calls) > 40)
 
     plant.unseen._cost = dearer
+    change = torch.tensor([-100.0, 10.0]).double().repeat(32)  # with the first and second model
     report = qm.improve(mpc, plant, **options)
     assert not report.kept
     assert report.gained == 1
     assert report.interval[1] < 0
+    assert not report.notes
+    calls.clear()
+    change = torch.linspace(-200.0, -100.0, 64).double()
+    change[-1] = 3000.0
+    report = qm.improve(mpc, plant, **options)
+    assert not report.kept
+    assert "In one loop it costs far more: a veto." in str(report)
     assert all(torch.equal(before[name], x) for name, x in mpc.state_dict().items())
 
 

@@ -252,8 +252,7 @@ class Controller:
             state = unpacked(content["controller"])
             options = {name: state.pop(name) for name in OPTIONS if name in state}
             controller = cls(LinearMPC.of_stored(content), **options)
-            settled = {"steps": len(controller.observer.gains) - 1}  # as in files without
-            controller._memory = Memory(**settled | state)
+            controller._memory = Memory(**state)
         except Exception as error:  # damaged files raise errors of any type
             raise damaged(Path(path), error, "a file that Controller.save wrote") from error
         return controller

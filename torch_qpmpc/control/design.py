@@ -17,6 +17,7 @@ from torch_qpmpc.control.scaling import Bounds, Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import DEFAULTS, check_used, read_levels
+from torch_qpmpc.mpc.scheme import check_keywords
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
 #: A response above this share of those soon after decides whether an output keeps its bound.
@@ -77,7 +78,7 @@ class Bands(NamedTuple):
 class Design:
     """The arguments of `LinearMPC`, read and checked, as arrays.
 
-    Weights are ``(n_y, n_y)`` and ``(m, m)``, NaN in ``y_slack`` ``(n_y,)`` becomes `prices`', and
+    Weights are ``(n_y, n_y)`` and ``(m, m)``, ``y_slack`` has the prices that are given, and
     ``u_bounds`` are within the ``levels`` of inputs, with the other arguments of `Bounds` for these
     in ``switching``. Known signals that bound an output or input from below and above are in
     ``limits`` by its name, "" on a side without one.
@@ -94,7 +95,7 @@ class Design:
     y_bounds: tuple[Array, Array]
     u_bounds: tuple[Array, Array]
     du_bounds: tuple[Array, Array]
-    y_slack: Array
+    y_slack: dict[str, float]
     linear: dict[str, str | float]
     references: str
     disturbances: Disturbances
@@ -111,24 +112,23 @@ class Design:
     def __post_init__(self) -> None:
         check_choice("references", self.references, ("held", "preview"))
         check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
-        if not (self.Q.any() or self.linear):
+        zones = (self.R.any() or self.dR.any()) and self.zoned.any()
+        if not (self.Q.any() or self.linear or zones):
             y, u = self.plant.outputs[0], self.plant.inputs[0]
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
         bounds = within_levels(self.u_bounds, self.levels, self.plant, self.du_bounds)
         object.__setattr__(self, "u_bounds", bounds)
-        default = self.prices(np.eye(len(self.Q), len(self.Q) + len(self.R)))
-        prices = np.where(np.isnan(self.y_slack), default, self.y_slack)
-        object.__setattr__(self, "y_slack", prices)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
         if (self.y_bounds[0] + self.margins[0] > self.y_bounds[1] - self.margins[1]).any():
             got = f"{self.violation}, which leaves no room between the bounds"
             raise QPError.expected("violation", got, "larger shares, or wider y_bounds")
-        if (self.y_slack < 0).any():
-            got = f"{self.y_slack.tolist()}"
-            raise QPError.expected("y_slack", got, "prices >= 0, or inf for hard rows")
+        if (self.slack < 0).any():
+            raise QPError.expected(
+                "y_slack", f"{self.y_slack}", "prices >= 0, or inf for hard rows"
+            )
 
     def __str__(self) -> str:
         plant, weights = self.plant, {"Q": self.Q, "R": self.R, "dR": self.dR}
@@ -148,8 +148,6 @@ class Design:
             return {**old, **changes}
         if unknown := sorted({*changes} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
-        if name == "y_slack":
-            return {**dict(zip(names, old.tolist(), strict=True)), **changes}
         if name.endswith("_bounds"):
             sides = [*zip(*(side.tolist() for side in old), strict=True)]
             limited = {} if name == "du_bounds" else self.limits
@@ -184,6 +182,13 @@ class Design:
         usual = np.abs(W) @ np.append(self.usual, self.scaling.u)
         return Y_SLACK * (self.typical or 1.0) / usual
 
+    @cached_property
+    def slack(self) -> Array:
+        """The prices of violations of the outputs' bounds, ``(n_y,)``."""
+        default = self.prices(np.eye(len(self.Q), len(self.Q) + len(self.R))).tolist()
+        pairs = zip(self.plant.outputs, default, strict=True)
+        return np.array([self.y_slack.get(name, price) for name, price in pairs])
+
     @property
     def usual(self) -> Array:
         """Usual deviations of the outputs, ``(n_y,)``.
@@ -195,6 +200,11 @@ class Design:
         costly = weights > 0
         by_weight = np.where(costly, 1 / np.sqrt(np.where(costly, weights, 1.0)), self.scaling.y)
         return np.where(self.ranged, ranges(self.y_bounds), by_weight)
+
+    @property
+    def zoned(self) -> Array:
+        """Mask of the outputs with a bound, ``(n_y,)``."""
+        return np.isfinite(self.y_bounds).any(0) | (self.limited[0] >= 0).any(0)
 
     @cached_property
     def ranged(self) -> Array:
@@ -217,22 +227,18 @@ class Design:
 
     @cached_property
     def normal(self) -> Design:
-        """This design in signals divided by their sizes, with its own prices."""
+        """This design in signals divided by their sizes, without what has none."""
         y, u, x, _ = self.scaling
         w, of_w = self.disturbances, self.of_w(y)
         half = {"y_bounds": y, "u_bounds": u, "du_bounds": u}
+        named = "levels", "u_target", "violation", "constraints", "terminal_constraints", "y_slack"
         return replace(
             self,
+            **{name: {} for name in named},
             plant=self.scaling.plant(self.plant),
-            levels={},
-            u_target={},
-            violation={},
-            constraints={},
-            terminal_constraints={},
             Q=self.Q * np.outer(y, y),
             R=self.R * np.outer(u, u),
             dR=self.dR * np.outer(u, u),
-            y_slack=self.y_slack * y,
             disturbances=w._replace(B=w.B * (of_w / x[:, None]), C=w.C * (of_w / y[:, None])),
             **{k: tuple(side / size for side in getattr(self, k)) for k, size in half.items()},
         )
@@ -276,7 +282,7 @@ class Design:
             for k, (part, limit) in enumerate(zip(sides, (-np.inf, np.inf), strict=True))
         )
         low, high = np.pad(self.margins, ((0, 0), (0, 2 * m)))[:, places]
-        price = np.append(self.y_slack, np.full(2 * m, np.inf))[places]
+        price = np.append(self.slack, np.full(2 * m, np.inf))[places]
         kinds, unit = np.repeat([0, 1, 2], (n_y, m, m))[places], np.eye(len(names))[places]
         K = np.pad(np.eye(n_d)[j], ((len(fixed), 0), (0, 0)))
         parts = np.array(["y_bounds", "u_bounds", "du_bounds"])[kinds], np.array(names)[places]
@@ -369,8 +375,7 @@ class Design:
         margins, errors = np.zeros((2, len(self.Q))), self.plant.errors
         for name, share in self.violation.items():
             i, got = self.plant.outputs.index(name), f"{share:g} of {name}"
-            bounded = np.isfinite(self.y_bounds).any(0) | (self.limited[0] >= 0).any(0)
-            if not 0 < share < 1 or not (bounded & (self.y_slack > 0))[i]:
+            if not 0 < share < 1 or not (self.zoned & (self.slack > 0))[i]:
                 raise QPError.expected("violation", got, "a share in (0, 1), of a bounded output")
             k = int(self.answers(DECIDES)[i])
             e = np.zeros(0) if errors is None else np.sort(errors[:, k - 1 : k, i], axis=None)
@@ -402,15 +407,14 @@ class Design:
         parts = (y - r, self.Q), (u - u_s, self.R), (du, self.dR)
         cost = sum(((x @ torch.as_tensor(W)) * x).sum(-1) for x, W in parts)
         for name, price in self.linear.items():
-            signal = isinstance(price, str)
-            level = known[..., self.plant.known.index(price)] if signal else price
+            level = known[..., self.plant.known.index(price)] if isinstance(price, str) else price
             cost = cost + level * u[..., self.plant.inputs.index(name)]
         lower, upper = map(torch.as_tensor, self.bounds_at(known.numpy())[0])
         own = self.combined("constraints")
         x = torch.cat((y, u), -1) @ torch.from_numpy(own.W.T)
         above = torch.cat((y - upper, x - torch.from_numpy(own.upper)), -1)
         below = torch.cat((lower - y, torch.from_numpy(own.lower) - x), -1)
-        outside, prices = above.relu() + below.relu(), np.append(self.y_slack, own.price)
+        outside, prices = above.relu() + below.relu(), np.append(self.slack, own.price)
         prices = torch.where(outside > 0, torch.from_numpy(prices), 0.0)  # inf times 0 is none
         return cost + (prices * outside).sum(-1)
 
@@ -522,6 +526,34 @@ class Design:
         return {name: unit[place] for name, place in places.items()}
 
 
+def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[str, Any]:
+    """Read weights and bounds by their arguments' names in `LinearMPC`, with new limits.
+
+    A mapping leaves what it does not name as the ``old`` design has it.
+
+    Raises:
+        QPError: one is invalid, or has another name.
+    """
+    y, u = plant.outputs, plant.inputs
+    readers: dict[str, Any] = {"Q": (read_weight, y), "R": (read_weight, u), "dR": (read_weight, u)}
+    readers |= {"y_bounds": (read_bounds, y), "u_bounds": (read_bounds, u)}
+    readers |= {"du_bounds": (read_moves, u), "y_slack": (read_said, y)}
+    readers |= {"u_target": (read_said, u), "violation": (read_said, y)}
+    readers["constraints"] = read_constraints, (*y, *u)
+    readers["terminal_constraints"] = read_constraints, y
+    check_keywords("redesign", wishes, [*readers])
+    limits = {} if old is None else old.limits
+    for name, value in wishes.items():
+        if old is not None and isinstance(value, Mapping):
+            wishes[name] = old.merged(name, value, readers[name][1])
+        if name in ("y_bounds", "u_bounds"):
+            names = readers[name][1]
+            wishes[name], own = read_limits(name, wishes[name], names, plant)
+            limits = {key: pair for key, pair in limits.items() if key not in names} | own
+    read = {k: readers[k][0](k, value, readers[k][1]) for k, value in wishes.items()}
+    return read | {"limits": limits}
+
+
 def within_levels(bounds: Bounds, levels: Any, plant: StateSpace, moves: Bounds) -> Bounds:
     """Return bounds of the inputs within their levels.
 
@@ -540,7 +572,7 @@ def within_levels(bounds: Bounds, levels: Any, plant: StateSpace, moves: Bounds)
         if not down <= -gap <= gap <= up:
             got = f"[{down:g}, {up:g}] of {name}"
             raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
-        lower[a], upper[a] = max(lower[a], own[0]), min(upper[a], own[-1])
+        lower[a], upper[a] = kept[0], kept[-1]
     return lower, upper
 
 
@@ -557,7 +589,7 @@ def read_switching(
         return {}, {}
     if not isinstance(u_levels, Mapping) or {*u_levels} - {*plant.inputs}:
         raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
-    levels = dict(zip(u_levels, read_levels(u_levels.values()), strict=True))
+    levels = dict(zip(u_levels, read_levels([*u_levels.values()], "u_levels"), strict=True))
     switching = {"integer_horizon": horizon, "max_nodes": nodes}
     for name, value in rules.items():
         own = dict(zip(levels, read_vector(name, value, [*levels], DEFAULTS[name]), strict=True))
@@ -690,21 +722,21 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
     """Read bounds as a mapping from names to pairs, or as one pair of numbers or vectors."""
     if value is None:
         value = {}
-    if not isinstance(value, Mapping):
-        pair = value
-    elif unknown := sorted({*value} - {*names}):
-        raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
-    else:
+    if isinstance(value, Mapping):
+        if unknown := sorted({*value} - {*names}):
+            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         pairs = [(None, None) if value.get(x) is None else value[x] for x in names]
         if not all(isinstance(x, Sequence) and len(x) == 2 for x in pairs):
             raise QPError.expected(name, repr(dict(value)), "pairs (lower, upper) by name")
-        pair = [
-            [limit if x is None else x for x in side]
-            for side, limit in zip(zip(*pairs, strict=True), (-np.inf, np.inf), strict=True)
-        ]
-    if not isinstance(pair, Sequence) or len(pair) != 2:
+        value = [*zip(*pairs, strict=True)]
+    if not isinstance(value, Sequence) or len(value) != 2:
         raise QPError.expected(name, repr(value), "the pair (lower, upper), or pairs by name")
-    lower, upper = (read_vector(f"{name}, side {i}", x, names, 0.0) for i, x in enumerate(pair))
+    sides = []
+    for i, (side, end) in enumerate(zip(value, (-np.inf, np.inf), strict=True)):
+        many = isinstance(side, list | tuple)
+        side = [end if x is None else x for x in (side if many else [side])]
+        sides.append(read_vector(f"{name}, side {i}", side if many else side[0], names, 0.0))
+    lower, upper = sides
     if (lower > upper).any():
         i = int(np.flatnonzero(lower > upper)[0])
         got = f"lower {lower[i]:g} > upper {upper[i]:g} for {names[i]}"

@@ -12,7 +12,7 @@ import torch
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import PREFIX
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
-from torch_qpmpc.control.review import Setting, set_points
+from torch_qpmpc.control.review import Setting, hard_rows, set_points
 from torch_qpmpc.control.simulation import Run, last_known
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
@@ -61,7 +61,8 @@ class Explanation:
             later *= bool(np.isfinite(self.y[-1, i]))
             lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
         for i, name in enumerate(plant.inputs):
-            rests = f", free: at rest near {self.design.resting[i]:.4g}" * bool(self.design.free[i])
+            held = "at rest" if self.design.R[i].any() else "no R holds it"
+            rests = f", free: {held} near {self.design.resting[i]:.4g}" * bool(self.design.free[i])
             shown = np.unique(np.linspace(0, len(self.u) - 1, 6).astype(int))[1:]
             later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
             later = f"{', then ' * bool(later)}{later}"
@@ -104,8 +105,9 @@ def explain(
     limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
-    finding = set_points(Setting(mpc, w, known[0]), memory.r, False)
-    reach = f"{finding.text} {finding.remedy}".rstrip()
+    findings = [set_points(Setting(mpc, w, known[0]), memory.r, False)]
+    findings += [hard_rows(design)] * (status == Outcome.INFEASIBLE)
+    reach = "\n".join(f"{x.text} {x.remedy}".rstrip() for x in findings)
     return Explanation(design, status, now, u, y, limits, names, reach)
 
 

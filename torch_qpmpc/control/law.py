@@ -171,12 +171,10 @@ class Law:
         mpc = self.mpc.redesigned(**{x: changes[x] for x in changes if x not in names})
         if not names.keys() & changes:
             return replace(self, mpc=mpc)
-        settings = {x: changes.get(x, {}) for x in names}
-        for name, value in settings.items():
-            if isinstance(value, Mapping):
-                old = zip(names[name], getattr(self, name).tolist(), strict=True)
-                settings[name] = {**dict(old), **value}
-        return Law.of(mpc, **settings)
+        old = {x: dict(zip(names[x], getattr(self, x).tolist(), strict=True)) for x in names}
+        new = {x: changes.get(x, {}) for x in names}
+        new = {x: {**old[x], **v} if isinstance(v, Mapping) else v for x, v in new.items()}
+        return Law.of(mpc, **new)
 
     def begun(self, u: Array | None = None, rests: bool = False) -> Memory:
         """Return a memory without a past, with the last input u, by default zero, in its bounds.

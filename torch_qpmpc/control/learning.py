@@ -293,7 +293,7 @@ def improve(
         hook.remove()
     held = ", ".join(name for name in leaves if not masks[name].any())
     notes = (f"Held, as outputs would settle beside r: {held}.",) if held else ()
-    return replace(report, notes=notes), law
+    return replace(report, notes=(*report.notes, *notes)), law
 
 
 def steady(design: Design, plan: QPMPC) -> dict[str, Tensor]:

@@ -16,21 +16,14 @@ from torch_qpmpc.checks import check_whole
 from torch_qpmpc.control.design import (
     Design,
     Target,
-    read_bounds,
-    read_constraints,
-    read_limits,
-    read_moves,
     read_prices,
     read_said,
     read_switching,
-    read_weight,
-    read_wished,
+    read_wishes,
     signals_of,
-    within_levels,
 )
 from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import aimed, lowered, target_mpc
-from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import VERSION, damaged, load_file, save_file
@@ -162,22 +155,20 @@ class LinearMPC:
         wishes = read_wishes(plant, None, Q=Q, R=R, dR=dR, **wished, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
         levels, switching = read_switching(u_levels, plant, rules, integer_horizon, max_nodes)
-        of_u = within_levels(wishes["u_bounds"], levels, plant, wishes["du_bounds"])
-        limits = wishes["y_bounds"], of_u, wishes["Q"]
-        scaling = Scaling.of(plant, *limits, int(horizon))  # pyright: ignore[reportArgumentType]
         design = Design(
             plant=plant,
             horizon=int(horizon),  # pyright: ignore[reportArgumentType] - a number
             **wishes,
             linear=read_prices(linear, plant),
             references=references,
-            disturbances=choose(plant, disturbances, scaling),
+            disturbances=choose(plant, None),
             gamma=gamma,
             blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
             levels=levels,
             switching=switching,
         )
-        self._start(design, options)
+        own = choose(plant, disturbances, design.scaling)
+        self._start(replace(design, disturbances=own), options)
 
     @classmethod
     def of_design(cls, design: Design, **options: Any) -> LinearMPC:
@@ -256,6 +247,7 @@ class LinearMPC:
         parts = unpacked(content["design"])
         parts["plant"] = StateSpace(**parts["plant"])
         parts["disturbances"] = Disturbances(**parts["disturbances"])
+        parts["y_slack"] = read_said("y_slack", parts["y_slack"], parts["plant"].outputs)
         mpc = cls.of_design(Design(**parts), **options)
         if mpc.plan.learned:  # else theta is the design's
             mpc.plan.load_state_dict(content["mpc"])
@@ -328,34 +320,6 @@ def _expanded(
             want = f"{shape[-1]} entries, and batch dimensions as those of the others"
             raise QPError.expected(name, f"shape {tuple(part.shape)}", want) from error
     return expanded
-
-
-def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[str, Any]:
-    """Read weights and bounds by their arguments' names in `LinearMPC`, with new limits.
-
-    A mapping leaves what it does not name as the ``old`` design has it.
-
-    Raises:
-        QPError: one is invalid, or has another name.
-    """
-    y, u = plant.outputs, plant.inputs
-    readers: dict[str, Any] = {"Q": (read_weight, y), "R": (read_weight, u), "dR": (read_weight, u)}
-    readers |= {"y_bounds": (read_bounds, y), "u_bounds": (read_bounds, u)}
-    readers |= {"du_bounds": (read_moves, u), "y_slack": (read_wished, y)}
-    readers |= {"u_target": (read_said, u), "violation": (read_said, y)}
-    readers["constraints"] = read_constraints, (*y, *u)
-    readers["terminal_constraints"] = read_constraints, y
-    check_keywords("redesign", wishes, [*readers])
-    limits = {} if old is None else old.limits
-    for name, value in wishes.items():
-        if old is not None and isinstance(value, Mapping):
-            wishes[name] = old.merged(name, value, readers[name][1])
-        if name in ("y_bounds", "u_bounds"):
-            names = readers[name][1]
-            wishes[name], own = read_limits(name, wishes[name], names, plant)
-            limits = {key: pair for key, pair in limits.items() if key not in names} | own
-    read = {k: readers[k][0](k, value, readers[k][1]) for k, value in wishes.items()}
-    return read | {"limits": limits}
 
 
 def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:

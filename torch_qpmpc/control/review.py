@@ -78,15 +78,16 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         r_last = law.read_set_points(r, 1, memory.r)
     assumed = known is None and memory.known is None
     known = last_known(design, memory) if known is None else law.read_known(known, 1)[0]
-    cost = _cost(mpc)
+    cost, terminal = _cost(mpc), _terminal(design)
     findings = [
         cost,
-        _terminal(design),
+        terminal,
         *([_free_inputs(design)] if design.free.any() else []),
+        *([_known(design)] if design.plant.known else []),
         *([_violation(design)] if design.violation else []),
         _horizon(design),
         _disturbances(design),
-        _hard_rows(design),
+        hard_rows(design),
         set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
     ]
     findings += [_levels(law, r_last, known)] if design.levels else []
@@ -94,7 +95,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         return Review(findings)
     plan, target = make_tables(mpc.plan), make_tables(mpc.targets)
     loop = LinearLoop.of(mpc, law.observer, plan, target)
-    findings.append(_stability(loop, design.gamma))
+    findings.append(_stability(loop, design.gamma, terminal.remedy))
     if loop.radius < 1:
         findings += [_margin(loop, law), _offset(loop, design)]
         if design.plant.noise is not None:
@@ -153,6 +154,16 @@ def _free_inputs(design: Design) -> Finding:
     return Finding("free inputs", True, f"Set-points leave inputs free, which rest near {rests}.")
 
 
+def _known(design: Design) -> Finding:
+    """Each known signal moves a state, bounds a signal or is a price."""
+    used = {*design.linear.values(), *sum(design.limits.values(), ())}
+    acts = zip(design.plant.known, design.acts, strict=True)
+    names = " and ".join(name for name, own in acts if not (own or name in used))
+    text = f"{names} moves no state, bounds nothing and is no price." if names else "All act."
+    remedy = "Pass its effect on the states by E." * bool(names)
+    return Finding("known signals", not names, text, remedy)
+
+
 def _violation(design: Design) -> Finding:
     """What the log promises of the outputs' bounds."""
     parts = []
@@ -192,7 +203,7 @@ def _disturbances(design: Design) -> Finding:
     return Finding("disturbances", ok, text, remedy * (not ok))
 
 
-def _hard_rows(design: Design) -> Finding:
+def hard_rows(design: Design) -> Finding:
     """Rows with outputs, which noise and loads may put out of reach, have finite prices."""
     rows = design.ends.beside(design.bands)
     hard = np.isinf(rows.price) & rows.W[:, : len(design.Q)].any(1)
@@ -316,12 +327,14 @@ def _reach(setting: Setting) -> Array:
     return ends * design.scaling.y[:, None] + (steady.y @ loads)[:, None]
 
 
-def _stability(loop: LinearLoop, gamma: float) -> Finding:
+def _stability(loop: LinearLoop, gamma: float, of_terminal: str) -> Finding:
     """The loop without bounds is stable."""
     slow = np.sort(np.abs(np.linalg.eigvals(loop.A)))[::-1][:3]
     ok = bool(loop.radius < 1 - 1e-9)
-    text = f"Without active bounds, the loop's largest eigenvalues are {_listed(slow)}."
-    remedy = "Take gamma=1." if gamma < 1 else "Lengthen the horizon, or weight more outputs."
+    listed = ", ".join(f"{x:.4g}" for x in slow)
+    text = f"Without active bounds, the loop's largest eigenvalues are {listed}."
+    remedy = of_terminal or "Lengthen the horizon, or weight more outputs."
+    remedy = "Take gamma=1." if gamma < 1 else remedy
     return Finding("stability", ok, text, remedy * (not ok))
 
 
@@ -365,7 +378,3 @@ def _offset(loop: LinearLoop, design: Design) -> Finding:
     text = f"Offsets that inputs could remove, in half ranges of the outputs: {left}."
     remedy = "Take disturbances='auto': one for each output."
     return Finding("offset", ok, text, remedy * (not ok))
-
-
-def _listed(x: Array) -> str:
-    return ", ".join(f"{value:.4g}" for value in x)

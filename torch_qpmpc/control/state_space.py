@@ -134,10 +134,8 @@ def read_model(
         E = np.stack([column.get(x, np.zeros(len(A))) for x in known], -1) if known else E
     elif isinstance(model, Sequence) and len(model) in (2, 3):
         if dt is not None:
-            remedy = (
-                "scipy.signal.lti(A, B, C, D) is sampled with dt; of matrices that are sampled "
-            )
-            remedy += "already, pass scipy.signal.dlti(A, B, C, D, dt=dt), without dt."
+            remedy = "scipy.signal.lti(A, B, C, D) is sampled with dt; of sampled matrices pass "
+            remedy += "scipy.signal.dlti(A, B, C, D, dt=dt), without dt."
             want = "None: they are those of one step, x+ = A x + B u"
             raise QPError.expected("dt", f"{dt:g} with matrices", want, remedy)
         A, B, *rest = (_matrix(f"model[{i}]", x) for i, x in enumerate(model))

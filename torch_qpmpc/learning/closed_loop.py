@@ -508,8 +508,7 @@ def improve(
     check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
     check_seed(seed)
     if isinstance(plant, Identified):
-        cost = cost or stage_cost(mpc.scheme)
-        plant = simulated_plant(plant, cost, mpc.horizon, members, seed)
+        plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), mpc.horizon, members, seed)
     if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
         got = f"{type(plant).__name__}, without {', '.join(missing)}"
         raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")
@@ -543,7 +542,8 @@ def improve(
         if not kept:
             mpc.load_state_dict(before)
     ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
-    return Improvement(kept, *ends, sum(bool(x.mean() < 0) for x in parts), members)
+    notes = ("In one loop it costs far more: a veto.",) * test.vetoed
+    return Improvement(kept, *ends, sum(bool(x.mean() < 0) for x in parts), members, notes)
 
 
 class Descent:

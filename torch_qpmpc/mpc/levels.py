@@ -291,7 +291,7 @@ def check_used(levels: str, given: dict[str, Any]) -> None:
             raise QPError.expected(name, repr(value), f"{levels} beside it", f"Pass {levels}.")
 
 
-def read_levels(value: Any) -> tuple[tuple[float, ...], ...]:
+def read_levels(value: Any, name: str = "action_levels") -> tuple[tuple[float, ...], ...]:
     """Read the levels of each action, none for an action between its bounds.
 
     Raises:
@@ -301,12 +301,12 @@ def read_levels(value: Any) -> tuple[tuple[float, ...], ...]:
     try:
         levels = tuple(() if x is None else tuple(float(v) for v in x) for x in value)
     except (TypeError, ValueError) as error:
-        raise QPError.expected("action_levels", repr(value), want) from error
+        raise QPError.expected(name, repr(value), want) from error
     for own in levels:
         steps = np.diff(own)
         if own and not (len(own) <= MOST and np.isfinite(own).all() and (steps > 0).all()):
             remedy = "The lowest level is off." + f" There may be {MOST}." * (len(own) > MOST)
-            raise QPError.expected("action_levels", f"{[*own]}", want, remedy)
+            raise QPError.expected(name, f"{[*own]}", want, remedy)
     return levels
 
 
