@@ -151,3 +151,17 @@ def test_what_holds_a_free_input_is_said():
         made = qm.Controller(mpc)
         made.step([0.0], [1.0])
         assert f"free: {held} near 0.5" in str(made.explain())
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+def test_the_set_point_in_force_is_judged(references):
+    """With held set-points the first row, else the last of the horizon."""
+    mpc = qm.LinearMPC(
+        ([[0.9]], [[0.5]]), 5, Q=1.0, dR=0.1, u_bounds=(-1, 1), references=references
+    )
+    made = qm.Controller(mpc)
+    rows = np.array([[0.0], *[[100.0]] * 5])
+    faults = made.review(r=rows).faults
+    made.step([0.0], rows)
+    assert any("not 100" in fault.remedy for fault in faults) == (references == "preview")
+    assert ("not 100" in made.explain().reach) == (references == "preview")

@@ -181,6 +181,16 @@ def test_bad_arguments_are_named(arguments, message):
         made().simulate(**{"r": [1.0], **arguments})
 
 
+def test_a_plant_of_other_steps_or_signals_in_another_order_is_named():
+    plants = [scipy.signal.dlti([[0.9]], [[0.5]], [[1.0]], [[0.0]], dt=dt) for dt in (1.0, 2.0)]
+    with pytest.raises(QPError, match=r"^plant: got dt = 2, expected the controller's 1"):
+        qm.Controller(qm.LinearMPC(plants[0], 5, Q=1.0)).simulate(plants[1], 3, r=[1.0])
+    plant = qm.LinearMPC(([[0.9, 0.0], [0.0, 0.2]], [[0.5, 0.0], [0.0, 0.1]]), 5, Q=1.0, dR=0.1)
+    crossed = replace(plant.design.plant, outputs=("y2", "y1"))
+    with pytest.raises(QPError, match=r"^plant: got y2, y1, u1, u2, expected the order of y1, y2"):
+        qm.Controller(plant).simulate(crossed, 3, r=[1.0, 0.0])
+
+
 def test_rows_of_known_signals_are_one_or_all():
     controller = made(E=[[0.3]], known=["rain"])
     with pytest.raises(QPError, match=r"^known: got 9 rows, expected one row, or at least 10"):

@@ -365,5 +365,9 @@ def test_invalid_registrations_are_refused(own_task):
     register(TASKS["mine"])
     with pytest.raises(QPError, match=r"task\.name: got 'point_mass', which is built in, exp"):
         register(dataclasses.replace(TASKS["mine"], name="point_mass"))
+    for names in (["start"], ["true model"], ["discounted"], ["a b", "a-b"]):
+        rivals: Any = dict.fromkeys(names, lambda plant: plant)
+        with pytest.raises(QPError, match=r"task\.rivals: .* expected names that differ as words"):
+            register(dataclasses.replace(TASKS["mine"], rivals=rivals))
     with pytest.raises(QPError, match="task: got str, expected a Task"):
         register("mine")  # pyright: ignore[reportArgumentType] (the mistake)

@@ -200,7 +200,7 @@ class Law:
         design, n = self.design, len(self.design.plant.A)
         memory, e, status = self._seen(memory, y, known)
         if valid := self._are_plausible(r, 0).all():
-            memory = memory._replace(r=r)
+            memory = memory._replace(r=r[:1] if design.references == "held" else r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
         try:

@@ -75,7 +75,8 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     """Return the findings about a controller; see `Controller.review`."""
     mpc, design, r_last = law.mpc, law.design, memory.r
     if r is not None:
-        r_last = law.read_set_points(r, 1, memory.r)
+        rows = 1 if design.references == "held" else design.horizon + 1
+        r_last = law.read_set_points(r, rows, memory.r)
     assumed = known is None and memory.known is None
     known = last_known(design, memory) if known is None else law.read_known(known, 1)[0]
     cost, terminal = _cost(mpc), _terminal(design)

@@ -155,6 +155,12 @@ def closed_loop(
 
 def _known(model: StateSpace, design: Design, d: Array) -> Array:
     """Return the rows of known signals that a model of a design's signals takes."""
+    dt, own_dt = model.dt, design.plant.dt
+    if dt and own_dt and not np.isclose(dt, own_dt):
+        raise QPError.expected("plant", f"dt = {dt:g}", f"the controller's {own_dt:g}")
+    got, want = ((*x.outputs, *x.inputs) for x in (model, design.plant))
+    if got != want and {*got} == {*want}:
+        raise QPError.expected("plant", ", ".join(got), f"the order of {', '.join(want)}")
     got, want = model.sizes[1:], (*design.plant.sizes[1:3], d.shape[1])
     if got != want and got != (*want[:2], 0):
         got, want = ("{} inputs, {} outputs, {} known signals".format(*x) for x in (got, want))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ from torch_qpmpc.mpc.scheme import Scheme
 
 #: A plant of any kind.
 AnyPlant = LinearSystem | GymnasiumPlant | Plant
+#: Names in the metrics that no rival may have.
+TAKEN = {"start", "learned", "candidate", "true_model", "discounted", "final"}
 
 
 @dataclass(frozen=True)
@@ -113,9 +116,13 @@ def register(task: Task) -> None:
     """Make ``task=NAME`` a choice of train.py; registering it again replaces the task.
 
     Raises:
-        QPError: a built-in task has the name.
+        QPError: a built-in task has the name, or two entries of the metrics would have one name.
     """
     check_kind("task", task, Task)
+    words = [re.sub(r"\W+", "_", name) for name in task.rivals]
+    if len({*words}) < len(words) or {*words} & TAKEN:
+        want = f"names that differ as words, from each other and {', '.join(sorted(TAKEN))}"
+        raise QPError.expected("task.rivals", f"{[*task.rivals]}", want)
     known = TASKS.get(task.name)
     if known is not None and known.defaults is None:
         raise QPError.expected("task.name", f"{task.name!r}, which is built in", "a new name")
