@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 #: The most transitions of an update of a nonlinear scheme.
 FEWER = 32
 #: A nonlinear plan, whose cost has no end, looks so many times as far ahead.
-FARTHER = 2
+FARTHER = 2.5
 #: The weight of an action in a nonlinear scheme, relative to the costs of the log, for one minimum.
 TINY = 1e-6
 NETWORKS = (
@@ -148,7 +149,7 @@ def nonlinear_start(cfg: Config, physics: AnyPlant, start: Start) -> Start | Non
     x, u, after = (start.log[key].double()[kept] for key in ("observation", "action", NEXT))
     cost = None if start.cost is None else -_rewards(start.log)[kept]
     model = fit_learned(torch.cat((x, u), -1), x, after, cost)
-    horizon = FARTHER * start.horizon
+    horizon = math.ceil(FARTHER * start.horizon)
     return start._replace(horizon=horizon, dynamics=model) if model.depth else None
 
 
