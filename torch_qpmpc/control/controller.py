@@ -102,7 +102,7 @@ class Controller:
         y = None if y is None else law.read("y", y, 1)[0]
         if known is not None or y is not None:
             d = law.read_known(known, 1)[0]
-            e = None if y is None else law.observer.at_rest(memory.u, d, y)
+            e = None if y is None else law.rested(memory.u, d, y)
             steps = 0 if y is None else len(law.observer.gains) - 1
             memory = memory._replace(known=d, e=e, rest=(y, memory.rest[1]), steps=steps)
         self._start(memory)
@@ -184,7 +184,8 @@ class Controller:
         measured = read_measured("y", y, law.design.plant.outputs)
         self._now = Signals(measured, set_points, ahead)
         move = law.step(self._memory, *self._now)
-        self._memory, self.status, self._plan = move.memory, move.status, move.plan
+        self._law, self._memory, self.status = move.law, move.memory, move.status
+        self._plan = move.plan
         if move.target is not None and move.p is not None:
             self.p, *target = map(torch.from_numpy, (move.p, *move.target))
             self.target = Target(*target)

@@ -100,7 +100,7 @@ def explain(
         u[np.abs(u) < ACTIVE * design.scaling.u] = 0.0
     for k in range(len(u)):
         rows.append(np.full(len(design.Q), np.nan) if e is None else law.observer.H @ e)
-        e = e if e is None else law.observer.predicted(e, u[min(k + 1, len(u) - 1)], known[k + 1])
+        e = e if e is None else law.predicted(e, u[min(k + 1, len(u) - 1)], known[k + 1])
     y = np.array(rows)
     limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]

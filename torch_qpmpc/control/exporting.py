@@ -123,6 +123,7 @@ def export_controller(
     law: Law, memory: Memory, folder: str | Path, name: str, missing: bool = False, **options: Any
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
+    law.design.plant.check_linear("C and FMUs")
     check_name(name)
     dtype = options.get("dtype", "float64")
     mpc, known = law.mpc, last_known(law.design, memory)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
@@ -10,8 +11,11 @@ from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torch_qpmpc.control.design import Design, Target, largest, read_wished
+from torch_qpmpc.control.disturbance import PREFIX
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import aimed
 from torch_qpmpc.control.observer import (
@@ -26,12 +30,16 @@ from torch_qpmpc.control.observer import (
 from torch_qpmpc.control.state_space import Array, read_table
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.mpc.levels import Searches
+from torch_qpmpc.mpc.nonlinear import SequentialQP
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.solve import AtRest
 from torch_qpmpc.qp.program import Status
 
 #: A number of steps that exceeds each minimum time.
 LONG = 2**30
+#: Of a nonlinear plant, the most QPs of the first plan and of others, the most linearisations for a
+#: point at rest, and the distance from it, relative to the signals' sizes, at which one is exact.
+COLD, WARM, NEWTON, NEAR = 30, 2, 5, 1e-3
 
 
 class Memory(NamedTuple):
@@ -105,11 +113,12 @@ PLANNED = (Outcome.SOLVED, Outcome.MISSING, Outcome.NODE_LIMIT)
 
 
 class Move(NamedTuple):
-    """The result of a step: the input, the memory after it, and target, p and plan, if any."""
+    """The result of a step: input, memory and law after it, and target, p and plan, if any."""
 
     u: Array
     memory: Memory
     status: Outcome
+    law: Law
     target: Target | None = None
     p: Array | None = None
     plan: BatchSolution | None = None
@@ -198,31 +207,100 @@ class Law:
         It raises for no value of them, so that the estimates go on.
         """
         design, n = self.design, len(self.design.plant.A)
-        memory, e, status = self._seen(memory, y, known)
+        watching = self.at(memory.e, memory.u, memory.known)
+        memory, e, status = watching._seen(memory, y, known)
         if valid := self._are_plausible(r, 0).all():
             memory = memory._replace(r=r[:1] if design.references == "held" else r)
         if e is None or status == Outcome.INVALID or not valid:
             return self._held(memory, e, Outcome.INVALID)
         try:
-            target = self._target(r, known, e[n:])
+            law, target = watching.aimed(r, known, e[n:])
         except SolverError:
             return self._held(memory, e, Outcome.INFEASIBLE)
-        p = design.arranged(np, e[:n], target, memory.u, known)
-        plan, ahead = self._planned(p, memory)
+        p = law.design.arranged(np, e[:n], target, memory.u, known)
+        plan, ahead = law._planned(p, memory, target, known, e[n:])
         if (found := plan.status[0]) and found != Status.NODE_LIMIT:
             status = Outcome.INFEASIBLE if found == Status.INFEASIBLE else Outcome.LIMIT
-            return self._held(memory, e, status)
+            return law._held(memory, e, status)
         u_s, moved = target.u[-1] if design.staged else target.u, plan.z[0, len(p) :]
         u = self._on_level(self._within(u_s + moved[: len(u_s)], memory), memory)
         memory = self._after(memory, e, u, ahead)
-        return Move(u, memory, Outcome.NODE_LIMIT if found else status, target, p, plan)
+        return Move(u, memory, Outcome.NODE_LIMIT if found else status, law, target, p, plan)
 
-    def _planned(self, p: Array, memory: Memory) -> tuple[BatchSolution, Array | None]:
-        """Return the plan, and the levels that it has from the next step on."""
+    @cached_property
+    def loads(self) -> Array:
+        """The map of w to what a nonlinear plant's inputs have besides u, ``(m, n_w)``."""
+        names, inputs = self.design.disturbances.names, self.design.plant.inputs
+        return np.array([[x == f"{PREFIX}{name}" for x in names] for name in inputs])
+
+    def at(self, e: Array | None, u: Array, d: Array | None, aims: bool = False) -> Law:
+        """Return the law of a nonlinear plant linearised at a point: its filter, or ``aims``, too.
+
+        It is this law if the plant is linear, the point unknown, or without a filter or a target.
+        """
+        if e is None or d is None or self.design.plant.dynamics is None:
+            return self
+        x, w = np.split(e, [len(self.design.plant.A)])
+        with suppress(QPError):
+            plant = self.design.plant.at(np.concatenate((d, x, u + self.loads @ w)))
+            own = self.design.disturbances._replace(B=plant.B @ self.loads)
+            design = replace(self.design, plant=plant, disturbances=own)
+            fixed = self.gain is not None
+            observer = self.observer if fixed else kalman(design, self.noise, self.drift)
+            mpc = LinearMPC.of_design(design, **self.mpc.options) if aims else self.mpc
+            return replace(self, mpc=mpc, observer=observer)
+        return self
+
+    def aimed(self, r: Array, known: Array, w: Array) -> tuple[Law, Target]:
+        """Return the target, and the law of a nonlinear plant linearised there.
+
+        Raises:
+            SolverError: the target's QP has no solution.
+        """
+        law, target = self, self._target(r, known, w)
+        for _ in range(0 if self.design.plant.dynamics is None else NEWTON):
+            x, u = (np.atleast_2d(part)[-1] for part in target[:2])
+            _, of_u, of_x, of_d = law.design.scaling
+            off = np.concatenate((known[-1], x, u + self.loads @ w)) - law.design.plant.point
+            before, far = law, np.abs(off) > NEAR * np.concatenate((of_d, of_x, of_u))
+            law = law.at(np.append(x, w), u, known[-1], aims=True) if far.any() else law
+            if law is before:
+                break
+            target = law._target(r, known, w)
+        return law, target
+
+    def _planned(
+        self, p: Array, memory: Memory, target: Target, known: Array, w: Array
+    ) -> tuple[BatchSolution, Array | None]:
+        """Return the plan, and the levels that it has from the next step on, or its moves."""
+        if self.design.plant.dynamics is not None:
+            plan, count = self.mpc.plan, COLD if memory.ahead is None else WARM
+            search = SequentialQP(self._moved(target, known, w), plan.layout, plan.gamma, count)
+            start = None if memory.ahead is None else torch.from_numpy(memory.ahead)
+            with torch.no_grad():
+                qp, fixed = plan.quadratic_program(), torch.from_numpy(p[None])
+                found = search.solve(qp, fixed, len(p) + plan.n_u, plan.solver, "mask", start)
+            parts = (getattr(found, name).numpy() for name in BatchSolution._fields)
+            return BatchSolution(*parts), found.later.numpy()
         if isinstance(self.plans, AtRest):
             return self.plans.solve(p[None]), None
         plan, places = self.plans.solve(p[None], memory.runs, memory.ahead)
         return plan, np.append(places[:, 1:], places[:, -1:], 1)
+
+    def _moved(self, target: Target, known: Array, w: Array) -> Callable[..., Tensor]:
+        """Return the dynamics of the plan's state, which is relative to the target."""
+        design, model = self.design, self.mpc.plan.scheme.model
+        n, place, f = len(design.plant.A), design.places["known"], design.plant.dynamics
+        x_s, u_s = (torch.from_numpy(np.atleast_2d(part)[-1]) for part in target[:2])
+        d_s = torch.from_numpy(np.where(design.acts, known[-1], design.nominal))
+        load, (A, B) = torch.from_numpy(self.loads @ w), (x[n:].mT for x in (model.A, model.B))
+
+        def dynamics(x: Tensor, u: Tensor, *d: Tensor) -> Tensor:
+            own = [d_s + part[..., place] for part in d] if len(d_s) else []
+            after = f(x_s + x[..., :n], u_s + load + u, *own) - x_s
+            return torch.cat((after, x @ A + u @ B), -1)
+
+        return dynamics
 
     @cached_property
     def switches(self) -> Array:
@@ -260,7 +338,7 @@ class Law:
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
         u = self._on_level(self._within(memory.u, memory), memory)
-        return Move(u, self._after(memory, e, u), status)
+        return Move(u, self._after(memory, e, u), status, self)
 
     def _target(self, r: Array, known: Array, w: Array) -> Target:
         """Return the `Target` for set-points and known signals by stage and an estimate of w.
@@ -292,7 +370,7 @@ class Law:
         The last input takes the place of an implausible entry of u, and is clipped into the bounds
         afterwards: the next step moves from there.
         """
-        memory, e, status = self._seen(memory, y, known)
+        memory, e, status = self.at(memory.e, memory.u, memory.known)._seen(memory, y, known)
         u = np.where(np.abs(u) <= self.max_plausible_u, u, memory.u)
         memory = self._after(memory, e, u, memory.ahead)
         return memory._replace(u=self._within(u, memory)), status
@@ -320,7 +398,7 @@ class Law:
         last = len(observer.gains) - 1
         k = min(memory.steps, last)  # another model, or a file of another machine, had more
         if e is None:
-            e = observer.start if k < last else observer.at_rest(memory.u, known[0], y)
+            e = observer.start if k < last else self.rested(memory.u, known[0], y)
         gain, error = observer.gains[k], y - observer.H @ e
         if P is not None or not every:
             gain, P = observer.corrected(observer.spread(k) if P is None else P, seen)
@@ -336,13 +414,29 @@ class Law:
         """Return the memory after a step with the input u."""
         if e is not None:
             assert memory.known is not None
-            e = self.observer.predicted(e, u, memory.known)
+            e = self.predicted(e, u, memory.known)
         runs = memory.runs
         if self.design.levels:
             on, runs = u > self.switches, np.zeros(len(u)) if runs is None else runs
             runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
             runs = np.clip(runs, -LONG, LONG).astype(np.int64)
         return memory._replace(u=u, e=e, runs=runs, ahead=ahead)
+
+    def predicted(self, e: Array, u: Array, d: Array) -> Array:
+        """Return the e after e with the input u and the known signals d."""
+        after, plant = self.observer.predicted(e, u, d), self.design.plant
+        if plant.dynamics is not None:
+            x, w = np.split(e, [len(plant.A)])
+            x = plant.after(x, u + self.loads @ w, d)
+            after[: len(x)] = np.where(np.isfinite(x).all(), x, after[: len(x)])
+        return after
+
+    def rested(self, u: Array, d: Array, y: Array) -> Array:
+        """Return the e that rests with u, d and y."""
+        e = self.observer.at_rest(u, d, y)
+        for _ in range(NEWTON if self.design.plant.dynamics else 0):
+            e = self.at(e, u, d).observer.at_rest(u, d, y)
+        return e
 
     def _within(self, u: Array, memory: Memory) -> Array:
         """Return inputs within their bounds, as known signals have them now."""
@@ -354,10 +448,12 @@ class Law:
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""
 
+        law = self
+
         def policy(signals: Signals) -> Move:
-            nonlocal memory
-            move = self.step(memory, *signals)
-            memory = move.memory
+            nonlocal law, memory
+            move = law.step(memory, *signals)
+            law, memory = move.law, move.memory
             return move
 
         return policy

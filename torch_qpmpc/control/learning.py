@@ -28,7 +28,6 @@ from torch_qpmpc.control.disturbance import choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import SMALL
-from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.simulation import Run, simulate
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_vector
 from torch_qpmpc.errors import QPError, SolverError
@@ -111,6 +110,7 @@ def learn(
     seed: int = 0,
 ) -> tuple[LearningReport, Law]:
     """Return the report and the law with the new model; see `Controller.learn`."""
+    law.design.plant.check_linear("learn")
     check_whole("transitions", transitions, 1)
     check_whole("steps", steps, 1)
     check_whole("pairs", pairs, FEWEST)
@@ -142,17 +142,10 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
     d = torch.cat([one.d for one in held_out.trajectories]).numpy()
     middle, size = _set_points(design, held_out, middle, spread)
     noise = np.sqrt(np.diag(identified.fit.model.S))
-
     model = read_model(identified, prices=design.linear.values())
-    n, m, n_y, _ = model.sizes
-    sizes = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
-    own, of_v = sizes.plant(model), np.concatenate((sizes.x, sizes.u))
-    balance = np.block([[np.eye(n) - own.A, -own.B], [own.C, np.zeros((n_y, m))]])
-    loads = np.concatenate((own.E @ (d.mean(0) / sizes.d) + own.offset, middle / sizes.y))
-    rest = of_v * np.linalg.lstsq(balance, loads, rcond=None)[0]
-    x, u = np.split(rest, [n])  # at rest in the middle
-    rest = {"x": x, "u": np.clip(u, *design.u_bounds)}
-    ends = len(d) - 1
+    own = replace(design, plant=model, disturbances=choose(model, None))
+    x, u, *_ = LinearMPC.of_design(own).target(middle, known=d.mean(0))
+    rest, ends = {"x": x.numpy(), "u": u.numpy()}, len(d) - 1
 
     def options(rng: np.random.Generator) -> dict[str, Any]:
         levels = _levels(design, middle, size, steps, rng)
@@ -275,6 +268,7 @@ def improve(
     law: Law, memory: Memory, source: Any, r: Any, spread: Any, **options: Any
 ) -> tuple[Improvement, Law]:
     """Return the report and the law with the new theta; see `Controller.improve`."""
+    law.design.plant.check_linear("improve")
     members, seed = options.pop("members", MEMBERS), options.get("seed", 0)
     check_whole("members", members, 1)
     check_seed(seed)

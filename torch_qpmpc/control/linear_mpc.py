@@ -27,6 +27,7 @@ from torch_qpmpc.control.lowering import aimed, lowered, target_mpc
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import VERSION, damaged, load_file, save_file
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.scheme import KEYWORDS, check_keywords
@@ -92,7 +93,7 @@ class LinearMPC:
             `QPMPC`; by default a tied structure that learns nothing, and DAQP.
 
     Attributes:
-        design: the `Design` of the arguments.
+        design, horizon: the `Design` of the arguments, and N.
         plan: the `QPMPC` of the plan, with V, Q, the policy and what is learned.
         targets: the QPMPC whose policy maps [f_0; r; w; d; 1] to the target; see
             `torch_qpmpc.control.lowering`.
@@ -179,14 +180,12 @@ class LinearMPC:
 
     def _start(self, design: Design, options: dict[str, Any]) -> None:
         """Make the QPs; those of the target are not learned."""
-        self.design, self.plan = design, QPMPC(lowered(design), **{**OPTIONS, **options})
+        self.design, self.horizon = design, design.horizon
+        self.plan = QPMPC(lowered(design), **{**OPTIONS, **options})
+        if self.plan.learned or self.plan.levels:
+            design.plant.check_linear("learn and u_levels")
         self.targets = target_mpc(design)
         self._target_qp = self.targets.quadratic_program()
-
-    @property
-    def horizon(self) -> int:
-        """The number of stages, N."""
-        return self.design.horizon
 
     @property
     def options(self) -> dict[str, Any]:
@@ -245,6 +244,8 @@ class LinearMPC:
         """Return the LinearMPC of the ``content`` of a file."""
         options = {name: content["arguments"][name] for name in KEYWORDS}
         parts = unpacked(content["design"])
+        if (dynamics := parts["plant"].get("dynamics")) is not None:
+            parts["plant"]["dynamics"] = LearnedModel(**dynamics)
         parts["plant"] = StateSpace(**parts["plant"])
         parts["disturbances"] = Disturbances(**parts["disturbances"])
         parts["y_slack"] = read_said("y_slack", parts["y_slack"], parts["plant"].outputs)
@@ -330,7 +331,11 @@ def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:
 
 
 def packed(value: Any) -> Any:
-    """Return dataclasses and named tuples as dictionaries, and arrays as tensors."""
+    """Return dataclasses and named tuples as dictionaries, and arrays as tensors, but no code."""
+    value = value.arguments if isinstance(value, LearnedModel) else value
+    if callable(value):
+        want = "what qm.identify_nonlinear returns, for a file"
+        raise QPError.expected("model", "a function", want)
     if is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if hasattr(value, "_asdict"):

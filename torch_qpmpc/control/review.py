@@ -79,6 +79,11 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         r_last = law.read_set_points(r, rows, memory.r)
     assumed = known is None and memory.known is None
     known = last_known(design, memory) if known is None else law.read_known(known, 1)[0]
+    if design.plant.dynamics is not None and len(r_last):
+        rows = design.horizon + 1, 1
+        held = np.tile(r_last[-1], rows), np.tile(known, rows), law.estimates(memory)[1]
+        law, _ = law.aimed(*held)
+        mpc, design = law.mpc, law.design
     cost, terminal = _cost(mpc), _terminal(design)
     findings = [
         cost,

@@ -183,7 +183,7 @@ class _Model:
 
     def step(self, u: Array) -> tuple[Array, dict]:
         model = self.model
-        self.x = model.A @ self.x + model.B @ u + model.E @ self.d[self.k] + model.offset
+        self.x = model.after(self.x, u, self.d[self.k])
         self.k += 1
         return model.C @ self.x, {}
 
@@ -191,9 +191,11 @@ class _Model:
 def ready(law: Law) -> Law:
     """Return a law with factored QPs and compiled code, by steps with active bounds and without."""
     memory, rows = law.begun(rests=True), (law.design.horizon + 1, 1)
-    y = law.design.middle
+    y, far = law.design.middle, 100.0 * law.design.usual
+    if (plant := law.design.plant).dynamics is not None:
+        y, far = plant.C @ plant.point[len(plant.known) :][: len(plant.A)], 0.0 * far
     known = np.tile(last_known(law.design, memory), rows)
-    for r in (y + 100.0 * law.design.usual, y):
+    for r in (y + far, y):
         memory = law.step(memory, y, np.tile(r, rows), known).memory
     return law
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,10 @@ import torch
 from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.identification.subspace import visited
+from torch_qpmpc.mpc.layout import Layout
+from torch_qpmpc.mpc.nonlinear import linearised
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
 Array = np.ndarray
@@ -35,6 +38,8 @@ class StateSpace:
         visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
         means: the means of its inputs and known signals, by name.
         errors: its errors of held-out predictions 1, .., N steps ahead, ``(rows, N, n_y)``.
+        dynamics: the function x+ = f(x, u) or f(x, u, d) of a nonlinear model, which is linearised
+            at the ``point`` [d; x; u]; None of a linear one.
 
     Raises:
         QPError: the shapes do not match, or the names do not.
@@ -54,6 +59,8 @@ class StateSpace:
     visited: tuple[Array, Array] | None = None
     means: Mapping[str, float] = field(default_factory=dict)
     errors: Array | None = None
+    dynamics: Any = None
+    point: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.A)
@@ -72,6 +79,32 @@ class StateSpace:
     def sizes(self) -> tuple[int, int, int, int]:
         """n, m, n_y and n_d."""
         return len(self.A), self.B.shape[1], len(self.C), self.E.shape[1]
+
+    def after(self, x: Array, u: Array, d: Array) -> Array:
+        """Return the next x."""
+        if self.dynamics is None:
+            return self.A @ x + self.B @ u + self.E @ d + self.offset
+        with torch.no_grad():
+            x = self.dynamics(*map(torch.from_numpy, (x, u, d)[: 2 + bool(len(d))]))
+        if isinstance(x, tuple):
+            raise QPError.expected("model", "a stage cost beside x+", "x+ alone", "Pass Q and R.")
+        return x.numpy()
+
+    def at(self, point: Array) -> StateSpace:
+        """Return the model linearised at another point; raise `QPError` if it is not finite."""
+        layout = Layout(len(self.A), len(self.inputs), 1, len(self.known))
+        parts = linearised(self.dynamics, layout, torch.from_numpy(point))
+        d, x, u = np.split(point, np.cumsum((len(self.known), len(self.A))))
+        found = *parts.values(), torch.from_numpy(self.after(x, u, d))
+        if not all(part.isfinite().all() for part in found):
+            got = f"x+ or its slope with NaN or inf at [d; x; u] = {point.round(6).tolist()}"
+            raise QPError.expected("model", got, "a smooth function near the points of the loop")
+        return replace(self, point=point, **{name: x.numpy() for name, x in parts.items()})
+
+    def check_linear(self, what: str) -> None:
+        """Raise `QPError` if a nonlinear model is to have what needs A and B."""
+        if self.dynamics is not None:
+            raise QPError.expected("model", "a nonlinear model", f"A and B, for {what}")
 
     def label(self, name: str) -> str:
         """Return ``name`` with its unit, as ``T [degC]``."""
@@ -97,7 +130,9 @@ def read_model(
     Args:
         model: (A, B) or (A, B, C_y) in discrete time, all states measured without C_y; a system
             with matrices A, B, C and D, such as control.StateSpace; or an `Identified`, whose names
-            and dt are its log's.
+            and dt are its log's. Of a nonlinear plant, (f, x, u) or (f, x, u, C_y): a function of
+            tensors x+ = f(x, u), or f(x, u, d) with known signals, and a state and an input that
+            it is linearised at first; or what `identify_nonlinear` returns.
         E: the factor of known signals, ``(n, n_d)``, in the model's own time.
         dt: the sampling time of a system; a continuous one is sampled with it, by zero-order hold.
         inputs, outputs, known: names; by default the system's own, or u1, .. and y1, ... Inputs of
@@ -115,6 +150,19 @@ def read_model(
         own = {"E": E, "dt": dt, "inputs": inputs, "outputs": outputs, "known": known or None}
         _check_absent("a StateSpace has its own", **own)
         return model
+    if isinstance(model, LearnedModel):
+        if model.identified is None:
+            raise QPError.expected("model", "a file's", "what qm.identify_nonlinear returns")
+        _check_absent("the log has its own", known=known or None)
+        plant = read_model(model.identified, E, dt, inputs, outputs)
+        return replace(plant, dynamics=model, errors=None).at(model.middle.numpy())
+    if isinstance(model, Sequence) and len(model) in (3, 4) and callable(model[0]):
+        _check_absent("the function has known signals as its d", E=E)
+        f, x, u, *C = model
+        x, u = (np.atleast_1d(_numbers(f"model[{i}]", z)) for i, z in ((1, x), (2, u)))
+        own = np.zeros((len(x),) * 2), np.zeros((len(x), len(u))), *(C or [np.eye(len(x))])
+        plant = read_model(own, None, None, inputs, outputs, known)
+        return replace(plant, dynamics=f, dt=dt).at(np.concatenate((np.zeros(len(known)), x, u)))
     offset, units, noise, states, means, errors = None, {}, None, None, {}, None
     if isinstance(model, Identified):
         _check_absent("the identification has its own", E=E)

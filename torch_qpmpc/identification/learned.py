@@ -12,14 +12,14 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.identification.identification import check_excitation
+from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.identification.log import complete
-from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.identification.ridge import ridge
 
 #: The networks, their width, and the steps, rate and batch of their training.
@@ -46,6 +46,7 @@ class LearnedModel(nn.Module):
     size: Tensor
     base: Tensor
     left: Tensor
+    identified: Identified | None = None
 
     def __init__(
         self, middle: Any, size: Any, base: Any, n_x: int, layers: Any = (), left: Any = ()
@@ -83,10 +84,11 @@ class LearnedModel(nn.Module):
 
 
 def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
-    """Learn the dynamics of measured outputs, which are the state, from a log.
+    """Learn the dynamics of a state from a log.
 
     Args:
-        trajectories: as in `identify`.
+        trajectories: as in `identify`: the outputs are the state. Or an `Identified`, whose
+            filter's estimates are the state.
         cost: the stage cost of each step, ``(T,)``, if the model shall have one.
 
     Raises:
@@ -101,9 +103,12 @@ def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
         >>> model(torch.ones(1), torch.ones(1))
         tensor([1.4000], dtype=torch.float64)
     """
-    log = as_log(trajectories)
-    check_excitation(log)
-    data = complete(log.trajectories)
+    given = isinstance(trajectories, Identified)
+    own = trajectories if given else identify(trajectories, order=0)
+    data = complete(own.log.trajectories)
+    if given:
+        x = own.fit.model.estimates
+        data = [(torch.as_tensor(x(*map(np.asarray, z))), *z[1:]) for z in own.log.trajectories]
     x, after, u, d = (
         torch.cat(part) for part in zip(*((y[:-1], y[1:], u, d) for y, u, d in data), strict=True)
     )
@@ -112,19 +117,16 @@ def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
         if len(cost) != len(u):
             want = f"{len(u)}, one for each step with outputs before and after"
             raise QPError.expected("cost", f"{len(cost)} numbers", want)
-    return fit_learned(torch.cat((d, x, u), -1), x, after, cost)
+    model = fit_learned(torch.cat((d, x, u), -1), x, after, cost)
+    model.identified = own
+    return model
 
 
 def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None) -> LearnedModel:
-    """Fit a model to transitions, in the order of time.
+    """Fit a model to transitions, in the order of time; raise `QPError` if there are few.
 
-    Args:
-        v: [d; x; u], ``(T, n)``.
-        x, after: the state and the next one, ``(T, n_x)``.
-        cost: the stage costs ``(T,)``, if they are known.
-
-    Raises:
-        QPError: there are few transitions.
+    They are v = [d; x; u] ``(T, n)``, the state x and the next one ``(T, n_x)``, and the stage
+    costs ``(T,)``, if they are known.
     """
     if len(v) < 2 * COUNT:
         raise QPError.expected("trajectories", f"{len(v)} steps", f"at least {2 * COUNT}")

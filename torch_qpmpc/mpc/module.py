@@ -25,7 +25,7 @@ from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
-from torch_qpmpc.mpc.nonlinear import PlanSolution, SequentialQP, at_origin
+from torch_qpmpc.mpc.nonlinear import PlanSolution, SequentialQP, linearised
 from torch_qpmpc.mpc.parametrizations import (
     SIGNED,
     Banded,
@@ -209,7 +209,7 @@ class QPMPC(nn.Module):
         """
         own = {x: options.pop(x) for x in (*KEYWORDS, *MODELS) if x in options}
         if own.get("dynamics") is not None and options.get("A") is None:
-            options |= at_origin(own["dynamics"], Layout(n_x, n_u, 1, n_d))
+            options |= linearised(own["dynamics"], Layout(n_x, n_u, 1, n_d))
         return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
 
     @classmethod

@@ -44,8 +44,8 @@ RANDOM, HOLD = 6, 5
 FRACTIONS = (1.0, 0.5, 0.2, 0.04)
 #: The proximal term in terms of H's diagonal: first, least, most, and its change by each QP.
 FIRST, LEAST, MOST, CHANGE = 1e-2, 1e-9, 1e4, 4.0
-#: A converged plan's step, and a rise of the cost that is rounding, relatively.
-SETTLED, ROUNDING = 1e-7, 1e-11
+#: A converged plan's step, and a rise of the cost that is rounding, relatively; too large a state.
+SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
 #: The price of a hard row's violation, relative to its largest multiplier.
 PRICE = 2.0
 #: The least eigenvalue of a definite Hessian, relatively.
@@ -316,6 +316,7 @@ class SequentialQP(nn.Module):
         z, costs = self.simulated(p.unsqueeze(1), tries)
         best = merit(every, z, costs).argmin(1)
         u, z, costs = (x[every, best] for x in (tries, z, costs))
+        z[~(z.abs() < OVERFLOW).all(1), n_p:] = 0.0
         pull, parts = fixed.new_full((B,), FIRST), []
         converged, done = torch.zeros(2, B, dtype=torch.bool)
         for _ in range(self.iterations):
@@ -340,7 +341,7 @@ class SequentialQP(nn.Module):
             found = self.simulated(p[todo].unsqueeze(1), tries)
             before = merit(todo, z[todo].unsqueeze(1), costs[todo].unsqueeze(1))[:, 0]
             after, best = merit(todo, *found).min(1)
-            better = solved & (after <= before + ROUNDING * (1 + before.abs()))
+            better = solved & after.isfinite() & (after <= before + ROUNDING * (1 + before.abs()))
             for own, new in zip((u, z, costs), (tries, *found), strict=True):
                 own[todo[better]] = new[among, best][better]
             size = step.abs().amax((1, 2)) / (1 + u[todo].abs().amax((1, 2)))
@@ -366,29 +367,27 @@ class SequentialQP(nn.Module):
         return torch.cat((torch.zeros_like(low).clamp(low, high), low + share * (high - low)), -3)
 
 
-def at_origin(dynamics: Callable[..., Any], layout: Layout) -> dict[str, Tensor]:
-    """Return A, B, E and the offset of the linearisation at the origin, by name."""
+def linearised(dynamics: Any, layout: Layout, w: Tensor | None = None) -> dict[str, Tensor]:
+    """Return A, B, E and the offset at w = [d; x; u], by default the origin, by name."""
     model = SequentialQP(dynamics, layout, 1.0)
-    w = torch.zeros(1, layout.n_d + layout.n, dtype=torch.float64)
-    out, J = _jacobian(model.outputs, w, layout.n_x + 1)
+    w = torch.zeros(layout.n_d + layout.n, dtype=torch.float64) if w is None else w
+    out, J = _jacobian(model.outputs, w[None], layout.n_x + 1)
     E, A, B = J[0, :-1].split(model.sizes, -1)
-    return {"A": A, "B": B, "E": E, "offset": out[0, :-1]}
+    return {"A": A, "B": B, "E": E, "offset": out[0, :-1] - J[0, :-1] @ w}
 
 
-def _jacobian(
-    function: Callable[[Tensor], Tensor], w: Tensor, size: int, create_graph: bool = False
-) -> tuple[Tensor, Tensor]:
-    """Return a function of w ``(.., n)`` with ``size`` outputs, and its Jacobian.
+def _jacobian(f: Any, w: Tensor, size: int, graph: bool = False) -> tuple[Tensor, Tensor]:
+    """Return a function f of w ``(.., n)`` with ``size`` outputs, and its Jacobian.
 
     One pass of a copy of w for each output: the function may have any operations.
     """
     with torch.enable_grad():
         copies = w.detach().expand(size, *w.shape).requires_grad_()
-        out = function(copies) + 0 * copies.sum(-1, keepdim=True)  # depends on w in any case
+        out = f(copies) + 0 * copies.sum(-1, keepdim=True)  # depends on w in any case
         units = torch.eye(size).to(w).reshape(size, *(1,) * (w.ndim - 1), size).expand_as(out)
-        options = {"create_graph": create_graph, "materialize_grads": True}
+        options = {"create_graph": graph, "materialize_grads": True}
         (J,) = torch.autograd.grad(out, copies, units, **options)
-    return (out[0] if create_graph else out[0].detach()), J.movedim(0, -2)
+    return (out[0] if graph else out[0].detach()), J.movedim(0, -2)
 
 
 def of_networks(model: LearnedModel, w: Tensor) -> tuple[Tensor, Tensor]:

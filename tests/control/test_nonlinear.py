@@ -1,0 +1,221 @@
+"""Controllers of nonlinear plants: a function, or what a log teaches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.testing import assert_allclose
+from torch import Tensor
+
+import torch_qpmpc as qm
+import torch_qpmpc.control.law
+from torch_qpmpc import QPError
+from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.identification import learned
+from torch_qpmpc.identification.learned import LearnedModel
+
+NAMES: Any = {"inputs": ["hot", "cold"], "outputs": ["level", "T"]}
+OPTIONS: Any = {"Q": {"level": 1.0, "T": 0.01}, "dR": 0.1, "du_bounds": (-0.2, 0.2)}
+OPTIONS |= {"u_bounds": (0.0, 2.0), "disturbances": {"level": "cold", "T": "hot"}}
+REST = [1.0, 40.0], [30 / 70, 40 / 70]
+NOISE = np.array([0.003, 0.1])
+
+
+def mixed(x: Tensor, u: Tensor, *d: Tensor) -> Tensor:
+    """Return level and temperature of a tank that mixes two flows, and a known third one."""
+    level, T = x.unbind(-1)
+    hot, cold = u.unbind(-1)
+    cold = cold + (d[0][..., 0] if d else 0.0)
+    out = level.clamp(min=1e-3).sqrt()
+    heat = (hot * (80 - T) + cold * (10 - T)) / level.clamp(min=0.1)
+    return x + 0.2 * torch.stack((hot + cold - out, heat), -1)
+
+
+def after(x: np.ndarray, u: np.ndarray, *d: np.ndarray) -> np.ndarray:
+    return mixed(*map(torch.from_numpy, (x, u, *d))).numpy()
+
+
+def controller(linear: bool = False, horizon: int = 10, **options: Any) -> qm.Controller:
+    model, own = (mixed, *REST), {**OPTIONS, **NAMES, **options}
+    if linear:
+        names = {name: own.pop(name) for name in NAMES}
+        model = replace(read_model(model, **names), dynamics=None)
+    return qm.Controller(qm.LinearMPC(model, horizon, **own), noise=NOISE)
+
+
+def loop(own: qm.Controller, set_points: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return outputs and inputs with noise and a constant load of the inputs."""
+    rng, x, states, inputs = np.random.default_rng(0), np.array(REST[0]), [], []
+    own.reset(y=x, u=REST[1])
+    for r in set_points:
+        inputs.append(own.step(x + NOISE * rng.normal(size=2), r=r))
+        assert own.status == 0
+        x = after(x, inputs[-1] + load)
+        states.append(x)
+    return np.array(states), np.array(inputs)
+
+
+def test_loads_leave_no_offset_far_from_the_first_point():
+    set_points, costs = np.repeat([[3.0, 25.0], [0.4, 60.0]], 50, 0), []
+    for linear in (False, True):
+        y, u = loop(controller(linear), set_points, np.array([0.0, 0.15]))
+        du, off = np.diff(u, axis=0, prepend=np.array(REST[1])[None]), y - set_points
+        assert (np.abs(u - 1) <= 1).all()
+        assert (np.abs(du) <= 0.2 + 1e-9).all()
+        costs.append((off**2 @ [1.0, 0.01]).sum() + 0.1 * (du**2).sum())
+        if not linear:
+            settled = np.abs(off.reshape(2, 50, 2)[:, 35:].mean(1))
+            assert (settled < NOISE).all()
+    assert costs[0] < 0.95 * costs[1]
+
+
+@pytest.mark.parametrize("references", ["held", "preview"])
+def test_a_linear_function_is_the_linear_plant(references, monkeypatch):
+    monkeypatch.setattr(torch_qpmpc.control.law, "WARM", 30)
+    A, B, E = np.array([[0.9, 0.1], [0.0, 0.7]]), np.array([[0.0], [0.5]]), np.array([[0.1], [0.0]])
+    C, parts = [[1.0, 0.0]], [torch.from_numpy(part.T) for part in (A, B, E)]
+    options: Any = {"Q": 1.0, "R": 0.1, "dR": 0.1, "u_bounds": (-1.0, 1.0), "known": ["rain"]}
+    options |= {"y_bounds": (-0.5, 0.8), "du_bounds": (-0.4, 0.4), "references": references}
+
+    def f(x: Tensor, u: Tensor, d: Tensor) -> Tensor:
+        return x @ parts[0] + u @ parts[1] + d @ parts[2]
+
+    pair = [
+        qm.Controller(qm.LinearMPC((A, B, C), 6, E=E, **options)),
+        qm.Controller(qm.LinearMPC((f, [0.3, 0.1], [0.2], C), 6, **options)),
+    ]
+    rng, x = np.random.default_rng(0), np.zeros(2)
+    for own in pair:
+        own.reset(y=[0.0], u=[0.0], known=[0.0])
+    for k in range(20):
+        known, y, u = rng.normal(size=(7, 1)) / 4, [x[0]], [0.0, 0.0]
+        y = None if k in (4, 5) else y
+        for i, own in enumerate(pair):
+            if k == 8:  # manual mode
+                own.observe(y, [0.3], known[0])
+                u[i] = 0.3
+            else:
+                u[i] = own.step(y, r=[2.0 * (k > 10) - 1.0], known=known)[0]
+                assert own.status == (4 if y is None else 0)
+        assert_allclose(u[1], u[0], atol=1e-6)
+        x = A @ x + B @ [u[0]] + E @ known[0] + [0.05, 0.0]
+    for name in ("x", "w", "p"):
+        assert_allclose(getattr(pair[1], name), getattr(pair[0], name), atol=1e-6)
+    for texts in zip(*((str(own.review()), str(own.explain())) for own in pair), strict=True):
+        assert texts[0] == texts[1]
+
+
+def test_known_flows_are_fed_forward():
+    costs = []
+    for seen in (True, False):
+        own, x, cost = controller(known=["rain"], R=1e-3), np.array(REST[0]), 0.0
+        own.reset(y=x, u=REST[1], known=[0.0])
+        for k in range(16):
+            rain = 0.4 * (np.arange(k, k + 11) >= 6)[:, None]
+            x = after(x, own.step(x, r=REST[0], known=rain if seen else [0.0]), rain[0])
+            cost += (x - REST[0]) ** 2 @ [1.0, 0.01]
+        costs.append(cost)
+    assert costs[0] < 0.3 * costs[1]
+
+
+def test_a_review_is_of_the_operating_point_that_a_user_names():
+    options: Any = {"disturbances": dict.fromkeys(NAMES["outputs"], "output")}
+    own = controller(**options)
+    for level, T in ([1.0, 40.0], [3.0, 25.0]):
+        review = own.review({"level": level, "T": T})
+        flows = np.linalg.solve([[1, 1], [80 - T, 10 - T]], [level**0.5, 0.0])
+        at = read_model((mixed, [level, T], flows), **NAMES)
+        mpc = qm.LinearMPC(replace(at, dynamics=None), 10, **OPTIONS | options)
+        twin = qm.Controller(mpc, noise=NOISE).review([level, T])
+        for name in ("terminal weight", "disturbances", "set-points", "stability", "margin"):
+            assert review[name].text == twin[name].text
+        assert not review.faults
+    assert own.review({"level": 20.0, "T": 40.0}).faults[0].name == "set-points"
+
+
+def test_a_run_starts_at_rest_and_ends_at_the_set_point():
+    own = controller()
+    own.reset(y=[2.0, 40.0], u=[0.6, 0.8])
+    run = own.simulate((mixed, *REST), 40, r=[2.5, 30.0])
+    assert np.abs(run.y[0] - own.simulate(steps=1, r=[2.5, 30.0]).y[0]).max() < 1e-9
+    assert_allclose(run.y[-1], [2.5, 30.0], atol=1e-2)
+
+
+def test_estimates_and_plans_survive_what_overflows():
+    def burning(x: Tensor, u: Tensor) -> Tensor:
+        return 0.8 * x + 0.2 * u + 1e-3 * torch.exp(50 * (x - 1.5))
+
+    own = qm.Controller(qm.LinearMPC((burning, [0.0], [0.0]), 10, Q=1.0, dR=0.1, u_bounds=(-9, 9)))
+    for y in (0.0, 60.0, 90.0, 1.0, 1.0):
+        assert np.isfinite(own.step([y], r=[1.0])).all()
+    assert np.isfinite(own.x).all()
+    assert own.status == 0
+
+
+@pytest.fixture(scope="module")
+def log() -> dict[str, np.ndarray]:
+    """A log of a tank behind a valve whose flow is a square root: the second state is hidden."""
+    rng, x, y, u = np.random.default_rng(0), np.array([1.0, 1.0]), [], []
+    for flow in rng.uniform(0.2, 1.8, 121).repeat(10):
+        y.append(x[1] + 0.01 * rng.normal())
+        u.append(flow)
+        x = x + 0.4 * (np.array([flow, x[0] ** 0.5]) - x**0.5)
+    return {"y": np.array(y)[:, None], "u": np.array(u[:-1])[:, None]}
+
+
+def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(learned, "STEPS", 300)
+    model = qm.identify_nonlinear(qm.identify(log, order=3))
+    assert model.depth
+    options: Any = {"Q": 1.0, "dR": 0.1, "u_bounds": (0.0, 2.0), "disturbances": {"y": "u"}}
+    own = qm.Controller(qm.LinearMPC(model, 10, **options), drift=0.02)
+    assert own.mpc.design.plant.noise is not None
+    x, rng, off = np.array([1.0, 1.0]), np.random.default_rng(1), []
+    own.reset(y=[1.0], u=[1.0])
+    for _ in range(80):
+        u = own.step(x[1:] + 0.01 * rng.normal(), r=[2.0])
+        x = np.maximum(x + 0.4 * (np.array([u[0] - 0.1, x[0] ** 0.5]) - x**0.5), 0.0)
+        off.append(x[1] - 2.0)
+    assert abs(np.mean(off[50:])) < 0.02
+    own.save(tmp_path / "own.qpmpc")
+    twin = qm.Controller.load(tmp_path / "own.qpmpc")
+    for _ in range(3):
+        assert_allclose(twin.step([1.9], r=[1.5]), own.step([1.9], r=[1.5]), rtol=1e-9)
+
+
+def test_what_needs_matrices_refuses_functions(tmp_path, log):
+    own = controller()
+    for call in (
+        lambda: own.export_c(tmp_path),
+        lambda: own.learn(log),
+        lambda: own.improve(log),
+        lambda: controller(learn=("H",)),
+        lambda: controller(u_levels={"hot": (0.0, 0.1)}),
+    ):
+        with pytest.raises(QPError, match="model: got a nonlinear model, expected A and B"):
+            call()
+    with pytest.raises(QPError, match="model: got a function, expected what"):
+        own.save(tmp_path / "own.qpmpc")
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "message"),
+    [
+        ((lambda x, u: x.sqrt() + u, [0.0], [0.0]), {}, "x\\+ or its slope with NaN or inf at"),
+        ((lambda x, u: x[0], [0.0], [0.0]), {}, "dynamics: got x\\+ and l of shapes"),
+        ((lambda x, u: (u, x[..., 0]), [0.0], [0.0]), {}, "model: got a stage cost"),
+        ((lambda x, u: x, [0.0], [0.0]), {"E": [[1.0]]}, "E: got .*, expected None"),
+        (
+            LearnedModel([0.0] * 2, [1.0] * 2, np.ones((3, 1)), 1),
+            {},
+            "model: got a file's",
+        ),
+    ],
+)
+def test_invalid_models_are_errors(model, options, message):
+    with pytest.raises(QPError, match=message):
+        qm.Controller(qm.LinearMPC(model, 5, Q=1.0, **options))
