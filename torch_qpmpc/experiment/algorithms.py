@@ -138,10 +138,11 @@ def evaluate(
     policy: Callable[[Tensor], Tensor],
     physics: AnyPlant,
     seed: int | None = None,
+    **options: int,
 ) -> ClosedLoop:
     """Run ``policy`` in closed loop, with the starts and the noise of a seed, or ``eval_seed``."""
     seed = cfg.eval_seed if seed is None else seed
-    options = {} if seed is None else {"seed": seed}
+    options |= {} if seed is None else {"seed": seed}
     return find_task(cfg.task).closed_loop(
         policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
     )

@@ -12,10 +12,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
-from torch_qpmpc.experiment.tasks import AnyPlant, find_task, make_mpc
+from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start, nonlinear_start
 from torch_qpmpc.files import damaged, write_whole
 from torch_qpmpc.learning.gate import PairedTest
@@ -31,9 +32,10 @@ LINEAR, REGULATOR, NONLINEAR = "linear MPC", "linear MPC, regulator's end", "non
 #: The table in a run's folder.
 STARTS = "starts.csv"
 NOTHING = (
-    "No candidate beats zero action, so learning starts from it. Pass a log about the states where "
-    "the controller is to work (start.file), one of short episodes if the plant is unstable "
-    "(task.episode_steps=20), or the plant's own cost (task.stage_weight)."
+    "No candidate beats zero action, so learning starts from it. Where one costs less here, allow "
+    "more episodes (task.start_episodes). Else pass a log about the states where the controller is "
+    "to work (start.file), one of short episodes if the plant is unstable (task.episode_steps=20), "
+    "or the plant's own cost (task.stage_weight)."
 )
 
 
@@ -135,9 +137,7 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         start, done = named.get(name), costs.get(name, torch.zeros(0, dtype=torch.float64))
         plant = physics if start is None else start.plant(physics)
         policy = zero_action(plant) if start is None else warm_policy(make_mpc(cfg, plant, start))
-        options = {"steps": cfg.task.eval_steps, "gamma": cfg.task.gamma, "starts": few}
-        options["seed"] = APART + cfg.seed + len(done)
-        loop = find_task(cfg.task).closed_loop(policy, plant, **options).costs
+        loop = evaluate(cfg, policy, plant, APART + cfg.seed + len(done), starts=few).costs
         costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))
         steps = len(loop)
         bar.update()
