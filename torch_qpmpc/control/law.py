@@ -434,7 +434,7 @@ class Law:
     def rested(self, u: Array, d: Array, y: Array) -> Array:
         """Return the e that rests with u, d and y."""
         e = self.observer.at_rest(u, d, y)
-        for _ in range(NEWTON if self.design.plant.dynamics else 0):
+        for _ in range(0 if self.design.plant.dynamics is None else NEWTON):
             e = self.at(e, u, d).observer.at_rest(u, d, y)
         return e
 
