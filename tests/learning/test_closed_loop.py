@@ -78,6 +78,48 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
         torch.testing.assert_close((leaf.grad * direction).sum(), expected, rtol=1e-4, atol=1e-7)
 
 
+class Pendulum:
+    """A plant with a sine that no linear policy knows."""
+
+    def starts(self, rng: torch.Generator, count: int) -> torch.Tensor:
+        return torch.randn(count, 2, generator=rng, dtype=torch.float64)
+
+    def draw(self, rng: torch.Generator, count: int) -> torch.Tensor:
+        return 0.05 * self.starts(rng, count)
+
+    def noise(self, nu: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        return draw
+
+    def step(self, s: torch.Tensor, a: torch.Tensor, nu: torch.Tensor | float) -> torch.Tensor:
+        angle, rate = s.unbind(-1)
+        force = 0.3 * a[..., 0] - 0.5 * angle.sin()
+        return torch.stack((angle + 0.1 * rate, 0.8 * rate + force), -1) + nu
+
+    def cost(self, s: torch.Tensor, a: torch.Tensor) -> torch.Tensor:
+        return s[..., 0] ** 2 + 0.1 * s[..., 1] ** 2 + 0.01 * a[..., 0] ** 2
+
+
+def test_loops_of_a_nonlinear_policy_have_their_gradient_and_improve():
+    plant, options = Pendulum(), {"stage_weight": [1.0, 1.0, 0.5], "action_bounds": ([-2.0], [2.0])}
+    options |= {"dynamics": lambda x, u: plant.step(x, u, 0.0), "iterations": 20, "gamma": 1.0}
+    options |= {"structure": "tied", "solver": "daqp", "learn": ("H", "H_f", "q")}
+    mpc = qm.QPMPC.of(2, 1, 3, **options)
+
+    def cost() -> torch.Tensor:
+        return _Loops(plant, 4, 1).run(mpc, 6).costs.mean()
+
+    _Loops(plant, 4, 1).mean_cost(mpc, 6).backward()
+    for name, leaf in mpc.coordinates().items():
+        if leaf.grad is not None:
+            direction = torch.ones_like(leaf).tril() if leaf.ndim > 1 else torch.ones_like(leaf)
+            expected = central_difference(cost, leaf, direction, 1e-4)
+            assert expected.abs() > 1e-6
+            found = (leaf.grad * direction).sum()
+            torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-7, msg=name)
+    report = qm.improve(mpc, plant, updates=5, loops=6, steps=5, held_out=16, rate=0.3)
+    assert report.after < 0.9 * report.before
+
+
 def test_the_policy_sees_the_state_of_the_identified_model(found):
     plain = dataclasses.replace(found, model=found.fit.model)
     assert len(plain.model.A) < len(found.model.A)

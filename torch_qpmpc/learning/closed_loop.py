@@ -463,11 +463,10 @@ def improve(
     theta is kept if `PairedTest` finds that it costs less in unseen loops of four times the
     ``steps``, and with no model clearly more; otherwise ``mpc`` stays as it was. One half of an
     identified plant's models trains theta, and the other one decides. A loop in which a QP has no
-    certified solution, or whose signals grow a million times, costs infinity; an update with such a
-    loop is skipped.
+    certified solution, or whose signals grow a million times, costs infinity and skips its update.
 
     Args:
-        mpc: the policy, with ``learn`` and ``structure`` of its own.
+        mpc: the policy, with its own ``learn`` and ``structure``; its dynamics are held.
         plant: an `Identified` model, whose filter's estimate is the QP's state; or a plant with
             ``starts(rng, count)``, ``draw(rng, count)``, ``noise(nu, draw)``, ``step(s, a, nu)``
             and ``cost(s, a)`` of a `torch_qpmpc.envs.LinearSystem`, differentiable in s and a. A
@@ -500,7 +499,8 @@ def improve(
         (True, True)
     """
     check_kind("mpc", mpc, QPMPC)
-    check_no_levels(mpc, "gradients of closed loops")
+    if mpc.sequential is None:
+        check_no_levels(mpc, "gradients of closed loops")
     window = steps if window is None else window
     own = {"updates": updates, "loops": loops, "steps": steps, "window": window, "members": members}
     for name, size in own.items():
