@@ -378,11 +378,12 @@ def test_where_noise_grows_the_sensors_part_neither_grows_nor_moves_the_state():
             x.append(0.8 * x[-1] + u[k] * (1 + rng.normal(size=1)) + 0.02 * rng.normal(size=1))
         logs.append({"y": np.array(x) + 0.2 * rng.normal(size=(61, 1)), "u": u})
     plant = simulated_plant(identify(logs, order=1), lambda p, u: p.sum(-1), 5, members=1)
+    assert plant._growth[0, 0, 2] == 0  # of the slow disturbance, whose size in a log is its own
     draw = torch.Generator().manual_seed(0)
     s = plant.starts(draw, 2000)
     for level, std in ((1.0, 1.0 / 0.6), (0.0, 0.02 / 0.6)):
         for _ in range(40):
             s = plant.step(s, torch.full((2000, 1), level).double(), plant.draw(draw, 2000))
-        assert s[:, 0].std().item() == pytest.approx(std, rel=0.4, abs=0.1)
+        assert s[:, 0].std().item() == pytest.approx(std, rel=0.4, abs=0.2)
     own, _, y, *_ = plant._parts(s)
     assert (y - plant._own.at("C", own)).std().item() == pytest.approx(0.2, rel=0.3)

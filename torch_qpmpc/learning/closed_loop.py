@@ -85,14 +85,14 @@ class SimulatedPlant:
         self.members = len(models)
         seen = [filtered(model, log) for model in (*models, observer)]
         self._d, self._u = (torch.cat(parts) for parts in ([x.d for x in log], [x.u for x in log]))
-        noises = (_noise(*own, self._u.numpy()) for own in zip(models, seen, strict=False))
-        noises = map(torch.stack, zip(*noises, strict=True))
-        self._residuals, self._growth, self._own.sensor = noises
-        self._horizon, n_y = horizon, self._residuals.shape[-1]
-        self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
         steps = torch.tensor([one.steps for one in log])
         self._first = (steps.cumsum(0) - steps).repeat_interleave(steps)
         self._last = (steps.cumsum(0) - 1).repeat_interleave(steps)
+        last = (torch.arange(len(self._u)) - 1).maximum(self._first).numpy()
+        parts = (_noise(*own, self._u.numpy(), last) for own in zip(models, seen, strict=False))
+        self._residuals, self._growth, self._own.sensor = map(torch.stack, zip(*parts, strict=True))
+        self._horizon, n_y = horizon, self._residuals.shape[-1]
+        self._sizes = [self._own.A.shape[-1], self._filter.A.shape[-1], n_y, 1, 1]
         self._seen = _stacked([x for x, _ in seen])
         self._y = torch.cat([x.y[:-1] for x in log])
         self._rows = torch.arange(len(self._d))  # where loops start, if from the log
@@ -109,8 +109,7 @@ class SimulatedPlant:
             return torch.cat((x, seen, y, k.to(x)), -1)
         x, seen = self._own.x0[one], self._filter.x0.expand(count, -1)
         nu = torch.randn(count, 2 * self._sizes[2], generator=rng, dtype=x.dtype)
-        k = torch.zeros(count, 2, dtype=torch.int64)
-        return self._measured(x, seen, nu, x.new_ones(1), k)
+        return self._measured(x, seen, nu, x.new_ones(1), torch.zeros(count, 2).long())
 
     def known(self, s: Tensor) -> Tensor:
         """Return what the policy sees, p ``(count, n_p)``."""
@@ -256,22 +255,25 @@ def filtered(model: Innovations, log: Sequence[Trajectory]) -> tuple[np.ndarray,
 
 
 def _noise(
-    model: Innovations, seen: tuple[np.ndarray, np.ndarray], u: np.ndarray
+    model: Innovations, seen: tuple[np.ndarray, np.ndarray], u: np.ndarray, last: np.ndarray
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return innovations in unit covariance, their variances' `growth`, and the sensor's root.
 
     With R = (I - C L) S of the sensor, whose noise moves the estimate, too, R + (C A L) R (C A L)'
     of S are its, but no more than S has at rest. Constant noise may as well move the state.
     """
-    (x, e), (_, _, _, _, C, L, S, *_) = seen, model
-    v = np.hstack((x, u))
+    (x, e), (A, B, E, _, C, L, S, *_) = seen, model
+    moves = np.hstack((A - np.diag(A.diagonal()), B, E)).any(1)  # others are slow disturbances
+    v = np.hstack((x * moves, u))
+    v = np.hstack((v, v[last]))  # noise on hidden states shows in outputs a step later
     known = np.isfinite(e).all(1)
     e, v = e[known] - e[known].mean(0), v[known]
     c = growth(e, v)
     e = e / np.sqrt(np.hstack((np.ones((len(v), 1)), v**2)) @ c.T)
     e = e @ np.linalg.pinv(_root(e.T @ e / len(e)), 1e-9, True)
+    c = np.hstack((c[:, :1], c[:, 1:].reshape(len(c), 2, -1).sum(1)))
     grows = c[:, 1:].any(1)
-    R, K = (S - C @ L @ S) * np.outer(grows, grows), C @ model.A @ L
+    R, K = (S - C @ L @ S) * np.outer(grows, grows), C @ A @ L
     root, size = _root((R + R.T) / 2), np.where(grows, np.diag(S), np.inf)
     share = np.square(np.hstack((root, K @ root))).sum(1) / size
     c[:, 0] -= (part := np.minimum(share, (1 - LEAST) * c[:, 0]))
@@ -289,7 +291,8 @@ def growth(e: np.ndarray, v: np.ndarray) -> np.ndarray:
     """
     m, n = v.shape
     sizes = np.concatenate(([1.0], (v**2).mean(0)))
-    X = np.hstack((np.ones((m, 1)), v**2)) / np.where(sizes > 0, sizes, 1.0)
+    sizes[sizes == 0] = np.inf
+    X = np.hstack((np.ones((m, 1)), v**2)) / sizes
     c = np.eye(1, 1 + n).repeat(e.shape[1], 0)
     for i, squares in enumerate((e**2).T):
         if not (mean := squares.mean()) > 0:
@@ -305,7 +308,7 @@ def growth(e: np.ndarray, v: np.ndarray) -> np.ndarray:
         fit = scipy.optimize.minimize(loss, start, jac=True, bounds=[(-20, 5)] * (1 + n))
         statistic = (m - fit.fun) / ((squares**2).mean() - 1) * 2
         if scipy.special.chdtrc(n, max(statistic, 0.0)) < LEVEL:
-            c[i] = np.exp(fit.x) / np.where(sizes > 0, sizes, 1.0)
+            c[i] = np.exp(fit.x) / sizes
     return c
 
 
@@ -578,10 +581,7 @@ class Descent:
         self._loops.start(seed)
 
     def update(self, penalty: Callable[[QPMPC], Tensor] | None = None) -> Tensor:
-        """Move theta once; return the mean cost of a step.
-
-        A cost or gradient that is not finite moves nothing. ``penalty`` is as in `improve`.
-        """
+        """Move theta once, if its gradient is finite; return the mean cost of a step."""
         self._mpc.zero_grad()
         mean = self._loops.mean_cost(self._mpc, self._window)
         if mean.isfinite():
