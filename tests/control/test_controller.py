@@ -115,7 +115,7 @@ def test_a_reset_starts_where_the_plant_rests():
         (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
         (
             lambda c: c.step({"T": 0.0}, [0.0]),
-            r"y: got signals \['T'\], expected the signals \['y1'\]",
+            r"y: got signals \['T'\], expected the signals \['y1'\]. None stands for a gap",
         ),
         (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
         (

@@ -166,8 +166,7 @@ def _known(design: Design) -> Finding:
     acts = zip(design.plant.known, design.acts, strict=True)
     names = " and ".join(name for name, own in acts if not (own or name in used))
     text = f"{names} moves no state, bounds nothing and is no price." if names else "All act."
-    remedy = "Pass its effect on the states by E." * bool(names)
-    return Finding("known signals", not names, text, remedy)
+    return Finding("known signals", not names, text, "Pass its effect by E." * bool(names))
 
 
 def _violation(design: Design) -> Finding:

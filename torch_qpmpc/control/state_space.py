@@ -244,7 +244,8 @@ def read_table(
         value = {column: value[column].to_numpy() for column in value.columns if column in names}
     if isinstance(value, Mapping):
         if {*value} != {*names}:
-            raise QPError.expected(name, f"signals {sorted(value)}", f"the signals {sorted(names)}")
+            got, want = f"signals {sorted(value)}", f"the signals {sorted(names)}"
+            raise QPError.expected(name, got, want, "None stands for a gap." * (name == "y"))
         columns = [np.atleast_1d(_numbers(name, value[x])) for x in names]
         try:
             table = np.stack(np.broadcast_arrays(*columns), axis=-1)
