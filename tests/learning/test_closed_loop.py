@@ -100,7 +100,8 @@ class Pendulum:
 
 
 def test_loops_of_a_nonlinear_policy_have_their_gradient_and_improve():
-    plant, options = Pendulum(), {"stage_weight": [1.0, 1.0, 0.5], "action_bounds": ([-2.0], [2.0])}
+    plant = Pendulum()
+    options: Any = {"stage_weight": [1.0, 1.0, 0.5], "action_bounds": ([-2.0], [2.0])}
     options |= {"dynamics": lambda x, u: plant.step(x, u, 0.0), "iterations": 20, "gamma": 1.0}
     options |= {"structure": "tied", "solver": "daqp", "learn": ("H", "H_f", "q")}
     mpc = qm.QPMPC.of(2, 1, 3, **options)

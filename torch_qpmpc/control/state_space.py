@@ -60,7 +60,7 @@ class StateSpace:
     means: Mapping[str, float] = field(default_factory=dict)
     errors: Array | None = None
     dynamics: Any = None
-    point: Array | None = None
+    point: Any = None
 
     def __post_init__(self) -> None:
         n = len(self.A)
