@@ -144,7 +144,7 @@ def train(
                 times.append(time.perf_counter())
 
                 sample = replay.sample() if cfg.replay else batch.reshape(-1)
-                penalised = learner.si is not None and replay.windows.can_sample()
+                penalised = learner.penalties.si is not None and replay.windows.can_sample()
                 windows = replay.sample_tau() if penalised else None
                 terms, losses = learner.learn(sample, windows)
                 if cfg.replay:

@@ -157,7 +157,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("scales[H]: got 0.0, expected a finite number >", G(scales={"cost": 0.0, "constraints": 0.0})),
     ("trust_region: got 'no', expected True or False.", G(trust_region="no")),
     ("target: got shape (), expected shape (4,). Squeeze its", lambda: gn.step(S, Aa, tensor(0.0))),
-    ("weighted: got 'yes', expected True or False.", lambda: Newton(weighted="yes")),
+    ("weighted: got 'yes', expected True or False.", lambda: Loss(weighted="yes")),
     (
         "penalty: got shape (3, 3), expected shape (12, 12).",
         lambda: free.step(S, Aa, V, penalty=eye(3)),

@@ -23,7 +23,8 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 def test_penalties_by_case(constraint):
     cfg = make_config(f"constraint={constraint}", *SMALL)
     mpc = make_mpc(cfg, make_physics(cfg))
-    deviation, si = make_penalties(cfg, mpc)
+    penalties = make_penalties(cfg, mpc)
+    deviation, si = penalties.deviation, penalties.si
     assert (deviation is not None) == (constraint in ("deviation", "combined", "identified"))
     assert (si is not None) == (constraint in ("si", "combined", "identified"))
     assert ("C" in mpc.learned) == (constraint != "fixed")
@@ -39,7 +40,8 @@ def test_penalties_have_the_configured_weights():
     overrides = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25")
     names = [f"constraint.{name}" for name in (*overrides, "si.beta=0.125")]
     cfg = make_config("constraint=combined", *SMALL, *names)
-    deviation, si = make_penalties(cfg, make_mpc(cfg, make_physics(cfg)))
+    penalties = make_penalties(cfg, make_mpc(cfg, make_physics(cfg)))
+    deviation, si = penalties.deviation, penalties.si
     assert deviation is not None
     assert deviation.C_mask.unique().tolist() == [0.25, 0.5, 2]
     assert si is not None

@@ -62,7 +62,8 @@ def test_each_key_is_read(tmp_path, monkeypatch):
         cfg = make_config(*SMALL, *sizes, *overrides)
         prefixes.clear()
         prefixes |= {id(cfg): ""} | {id(vars(cfg)[x]): f"{x}." for x in GROUPS}
-        prefixes |= {id(vars(cfg.constraint)[x]): f"constraint.{x}." for x in ("deviation", "si")}
+        parts = {x: vars(cfg.constraint)[x.partition(".")[2]] for x in OPTIONAL}
+        prefixes |= {id(part): f"{x}." for x, part in parts.items()}
         train.train(cfg, str(tmp_path / name))
     text = (CONFIGS / "config.yaml").read_text(encoding="utf-8").partition("hydra:")[2]
     seen |= set(re.findall(r"\$\{(?!hydra\.)([\w.]+)\}", text))

@@ -15,6 +15,7 @@ from tests.runs import SMALL, make_config
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, GaussNewton
 from torch_qpmpc.files import load_file
+from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.updates import first_order
 from torch_qpmpc.mpc.state import KIND
 
@@ -74,7 +75,7 @@ def test_a_gradient_that_is_not_finite_moves_nothing():
     mpc = drawn_mpc(2, 1, 3, learn=["C"], solver="daqp")
     optimizer = torch.optim.SGD(mpc.parameter_groups({"cost": 1.0, "constraints": 1.0}))
     before = mpc.C.detach().clone()
-    update = first_order(mpc, Steep(mpc), optimizer, None, None)  # pyright: ignore[reportArgumentType] -- what is used of a loss is there
+    update = first_order(mpc, Steep(mpc), optimizer, Penalties())  # pyright: ignore[reportArgumentType] -- what is used of a loss is there
     terms, _ = update(transitions(), None)
     assert terms["loss/value"] == 0
     assert torch.equal(mpc.C, before)

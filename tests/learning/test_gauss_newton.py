@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import math
 import warnings
+from typing import Any
 
 import pytest
 import torch
@@ -72,18 +73,23 @@ def test_the_step_is_the_same_with_more_pairs_than_entries_of_theta(name):
 
 
 @pytest.mark.parametrize("name", ["C alone", "tied"])
-def test_weights_are_those_of_the_squared_errors(name):
+@pytest.mark.parametrize("given", ["inverse variance", "priorities"])
+def test_weights_are_those_of_the_squared_errors(name, given):
     mpc = random_mpc(2, **PARTS[name])
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False, weighted=True)
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
     s, a = random_states(40, mpc.n_p, size=0.9), random_states(40, 1, size=0.45, seed=1)
     value = mpc.action_value(s, a).detach()
     error = 0.1 * a[:, 0] * normal(40, seed=2)
+    own: Any = {"weighted": True}
     weight = inverse_variance(s, a, value, error, torch.ones(40).bool())
+    if given == "priorities":
+        own = {"weights": normal(40, seed=3).square()}
+        weight = own["weights"] / own["weights"].mean()
     reference = Reference(mpc, optimizer)
     expected = reference.step(s, a, value + error, weight=weight)
     assert not torch.allclose(expected, Reference(mpc, optimizer).step(s, a, value + error))
     before = reference.theta()
-    optimizer.step(s, a, value + error)
+    optimizer.step(s, a, value + error, **own)
     assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
 
 
@@ -193,7 +199,7 @@ def test_a_clipped_error_moves_theta_as_far_as_the_clip():
     twin = copy.deepcopy(mpc)
     s, a = pairs(1)
     value = mpc.action_value(s, a).detach()
-    GaussNewton(mpc, td_error_clip=0.1).step(s, a, value + 5.0)
+    GaussNewton(mpc).step(s, a, value + 5.0, clip=0.1)
     GaussNewton(twin).step(s, a, value + 0.1)
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
 
@@ -229,12 +235,16 @@ def test_a_warm_start_saves_time_only():
         ("lr", 0.0, r"a number in \(0, 1\]"),
         ("lr", 1.1, r"a number in \(0, 1\]"),
         ("damping", -1.0, "a finite number > 0"),
-        ("td_error_clip", math.inf, "a finite number > 0"),
     ],
 )
 def test_numbers_out_of_range_are_named(name, value, expected):
     with pytest.raises(QPError, match=f"{name}: got {value}, expected {expected}"):
         GaussNewton(random_mpc(), **{name: value})
+
+
+def test_a_clip_out_of_range_is_named():
+    with pytest.raises(QPError, match="clip: got inf, expected a finite number > 0"):
+        GaussNewton(mpc := random_mpc(2)).step(*pairs(), targets(mpc), clip=math.inf)
 
 
 def test_unknown_scales_are_named():
@@ -261,7 +271,7 @@ def test_a_batch_without_a_usable_pair_moves_nothing(bad, trust_region):
         report = optimizer.step(s, a, torch.full((COUNT,), bad), penalty=penalty)
     assert not report.accepted
     assert math.isnan(report.ratio)
-    assert (report.unsolved, report.without_target) == (1, 6)
+    assert not report.usable.any()
     assert report.damping == optimizer.param_groups[0]["damping"] == 0.03
     assert_close(mpc.state_dict(), before, rtol=0, atol=0)
     assert not optimizer.state
@@ -272,5 +282,5 @@ def test_the_trust_region_counts_weighted_errors():
     mpc = random_mpc(2)
     s, a = random_states(40, 2, size=0.9), random_states(40, 1, size=0.45, seed=1)
     target = mpc.action_value(s, a).detach() + 1e-4 * a[:, 0] * normal(40, seed=2)
-    report = GaussNewton(mpc, damping=1.0, weighted=True).step(s, a, target)
+    report = GaussNewton(mpc, damping=1.0).step(s, a, target, weighted=True)
     assert report.ratio == pytest.approx(1, abs=0.01)

@@ -59,7 +59,7 @@ def test_unsolved_samples_are_masked(where, bad):
 def test_a_batch_without_any_solved_sample():
     operator, td = hard_operator(), feasible_batch(3)
     td["observation"] += 5.0
-    message = "None of the batch's 3 transitions is usable: 3 without a QP .*, 0 with an invalid"
+    message = "None of the 3 pairs is usable: 3 without a QP solution, 0 without a finite target"
     with pytest.warns(RuntimeWarning, match=message):
         out, total = gradients(make_loss(operator=operator), td)
     assert out["unsolved"].item() == 3

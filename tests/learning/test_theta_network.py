@@ -27,6 +27,7 @@ from torch_qpmpc import (
     QPQLearningLoss,
     ThetaNetwork,
 )
+from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.updates import second_order
 
 SIZES = {"q": 0.3, "b": 0.1, "c": 1.0}
@@ -201,7 +202,7 @@ def test_gauss_newton_takes_no_upstream_modules():
     for network in (critic_of(theta, operator), operator):
         loss = QPQLearningLoss(network)
         with pytest.raises(QPError, match=message):
-            second_order(mpc, loss, GaussNewton(mpc), None, None)
+            second_order(mpc, loss, GaussNewton(mpc), Penalties())
 
 
 def test_the_network_reads_other_keys():

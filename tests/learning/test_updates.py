@@ -17,11 +17,13 @@ from torch_qpmpc import (
     DeviationPenalty,
     GaussNewton,
     QPActorValueOperator,
+    QPError,
     QPQLearningLoss,
     SystemIdentificationPenalty,
 )
+from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.replay import ACTIVE_SET, windows_to_tau
-from torch_qpmpc.learning.updates import first_order, second_order, share_of_rate
+from torch_qpmpc.learning.updates import first_order, rate_of_C, second_order
 
 
 def make_loss(mpc, key: str | None = None, **options) -> QPQLearningLoss:
@@ -35,7 +37,7 @@ def test_the_first_order_descends_the_sum_of_its_terms():
     twin, loss = copy.deepcopy(mpc), make_loss(mpc)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
-    update = first_order(mpc, loss, optimizer, None, si)
+    update = first_order(mpc, loss, optimizer, Penalties(si=si))
     terms, scalars = update(transitions(), windows)
     assert terms.pop("train/accepted") == 1
     assert set(terms) == {"loss/value", "loss/si"}
@@ -49,27 +51,37 @@ def test_the_first_order_descends_the_sum_of_its_terms():
 
 
 @pytest.mark.parametrize("with_si", [False, True])
-@pytest.mark.parametrize("clip", [None, 0.5])
-def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, clip):
+@pytest.mark.parametrize(
+    ("options", "step"),
+    [
+        ({}, {}),
+        ({"td_error_clip": 0.5}, {"clip": 0.5}),
+        ({"weighted": True}, {"weighted": True}),
+        ({"use_prioritized_weights": True}, {"weights": torch.arange(20).double()}),
+    ],
+)
+def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, options, step):
     mpc = random_mpc(3)
-    twin, loss = copy.deepcopy(mpc), make_loss(mpc, td_error_clip=clip)
+    twin, loss = copy.deepcopy(mpc), make_loss(mpc, **options)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
-    update = second_order(
-        mpc, loss, GaussNewton(mpc, td_error_clip=clip), None, si if with_si else None
-    )
-    batch = transitions()
+    before, batch = mpc.C.detach().clone(), transitions(20)
+    optimizer = GaussNewton(mpc, trust_region=False)
+    update = second_order(mpc, loss, optimizer, Penalties(si=si if with_si else None))
+    if "weights" in step:
+        batch["priority_weight"] = step["weights"]
     terms, scalars = update(batch, windows if with_si else None)
-    expected = make_loss(twin, td_error_clip=clip)(transitions())
+    expected = make_loss(twin, td_error_clip=options.get("td_error_clip"))(transitions(20))
     assert_close(terms["loss/value"], expected["loss_value"].detach())
     assert ("loss/si" in terms) == with_si
     for name in ("td_error", "pred_value", "target_value", "unsolved"):
         assert_close(scalars[name], expected[name])
     with torch.no_grad():
-        target = make_loss(twin).target(transitions())
+        target = make_loss(twin).target(transitions(20))
         s, a = batch["observation"], batch["action"]
         penalty = si.curvature(windows) if with_si else None
-        GaussNewton(twin, td_error_clip=clip).step(s, a, -target, penalty=penalty)
+        GaussNewton(twin, trust_region=False).step(s, a, -target, penalty=penalty, **step)
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
+    assert (mpc.C - before).abs().max() > 1e-4
 
 
 @pytest.mark.parametrize("second", [False, True])
@@ -84,9 +96,11 @@ def test_a_preview_and_an_observation_move_theta_as_one_observation_does(second)
         loss.make_value_estimator(gamma=0.9)
         si = SystemIdentificationPenalty(1e-2)
         if second:
-            update = second_order(mpc, loss, GaussNewton(mpc), None, si)
+            update = second_order(mpc, loss, GaussNewton(mpc), Penalties(si=si))
         else:
-            update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, si)
+            update = first_order(
+                mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), Penalties(si=si)
+            )
         before = copy.deepcopy(mpc.state_dict())
         terms, scalars = update(batch.reshape(-1).copy(), tau)
         assert scalars["unsolved"] == 0
@@ -106,9 +120,9 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
     batch["next", "reward"][4] = torch.nan
     if second:
         optimizer = GaussNewton(mpc, trust_region=False)
-        update = second_order(mpc, loss, optimizer, None, None)
+        update = second_order(mpc, loss, optimizer, Penalties())
     else:
-        update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), None, None)
+        update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), Penalties())
     before = mpc.C.detach().clone()
     with pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): 1 of \d+ rewards are NaN"):
         terms, scalars = update(batch, None)
@@ -126,7 +140,7 @@ def test_an_update_without_a_usable_transition_moves_nothing(second):
     make, optimizer = first_order, torch.optim.SGD(mpc.parameters(), 1e-3)
     if second:
         make, optimizer = second_order, GaussNewton(mpc)
-    update = make(mpc, make_loss(mpc), optimizer, deviation, None)
+    update = make(mpc, make_loss(mpc), optimizer, Penalties(deviation))
     with (
         pytest.warns(RuntimeWarning, match=r"None of .* usable: 0 without a QP sol"),
         pytest.warns(RuntimeWarning, match=r"\('next', 'reward'\): (\d+) of \1 rewards"),
@@ -144,7 +158,7 @@ def test_a_first_order_update_without_a_usable_transition_moves_nothing(cause):
     deviation = DeviationPenalty(mpc, c_2=1e-2, c_3=1e-2)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     optimizer = torch.optim.Adam(mpc.parameter_groups(RATES), weight_decay=0.1)
-    update = first_order(mpc, make_loss(mpc), optimizer, deviation, si)
+    update = first_order(mpc, make_loss(mpc), optimizer, Penalties(deviation, si))
     update(transitions(), windows)
     before = copy.deepcopy((mpc.state_dict(), optimizer.state_dict()["state"]))
     batch = transitions()
@@ -165,11 +179,11 @@ def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty):
     """Make an update and its optimiser."""
     loss = make_loss(mpc, td_error_clip=1.0)
     if name == "gauss_newton":
-        optimizer = GaussNewton(mpc, td_error_clip=1.0)
-        return second_order(mpc, loss, optimizer, deviation, None), optimizer
+        optimizer = GaussNewton(mpc)
+        return second_order(mpc, loss, optimizer, Penalties(deviation)), optimizer
     kind = torch.optim.Adam if name == "adam" else torch.optim.SGD
     optimizer = kind(mpc.parameter_groups(RATES))
-    return first_order(mpc, loss, optimizer, deviation, None), optimizer
+    return first_order(mpc, loss, optimizer, Penalties(deviation)), optimizer
 
 
 @pytest.mark.parametrize(
@@ -212,16 +226,34 @@ def test_the_penaltys_weight_falls_with_the_rate_of_C(optimizer):
     mpc = random_mpc(3)
     deviation = DeviationPenalty(mpc)
     _, made = make_update(optimizer, mpc, deviation)
-    assert share_of_rate(made) == 1, "without a schedule"
+    assert rate_of_C(mpc, made) == (mpc.C, 1), "without a schedule"
     schedule, shares = LambdaLR(made, lambda update: 1 / (1 + update)), []
     for _ in range(3):
-        shares.append(share_of_rate(made))
+        shares.append(rate_of_C(mpc, made)[1])
         made.param_groups[0]["lr"] = 0.5  # of H
         schedule.step()
     assert shares == pytest.approx([1, 1 / 2, 1 / 3])
     still = torch.optim.SGD(mpc.parameter_groups(RATES | {"C": 0.0}))
     LambdaLR(still, lambda update: 0.5)
-    assert share_of_rate(still) == 1, "a C that does not move has no share"
+    assert rate_of_C(mpc, still)[1] == 1, "a C that does not move has no share"
+
+
+def test_the_deviation_penalty_needs_the_rate_of_a_free_C():
+    """It finds C in groups without names, and says so before theta moves."""
+    mpc = random_mpc(3, free=0.0)
+    deviation, loss = DeviationPenalty(mpc), make_loss(mpc, td_error_clip=1.0)
+    optimizer = torch.optim.SGD(mpc.parameters(), 1e-3)
+    first_order(mpc, loss, optimizer, Penalties(deviation))(transitions(), None)
+    moved = (mpc.C - mpc.C_0).detach().abs()
+    assert (moved[deviation.C_mask == 0] > 0).all()
+    assert (moved[deviation.C_mask == 1] == 0).all()
+    others = torch.optim.SGD(mpc.leaves("H"), 1e-2)
+    with pytest.raises(QPError, match="optimizer: got one that does not move C, expected"):
+        first_order(mpc, loss, others, Penalties(deviation))
+    fixed = random_mpc(3, learn=("H",))
+    penalties = Penalties(DeviationPenalty(fixed))
+    with pytest.raises(QPError, match="optimizer: got one that does not move C, expected"):
+        second_order(fixed, make_loss(fixed), GaussNewton(fixed), penalties)
 
 
 def test_the_second_order_finds_the_gain_of_the_riccati_equation():
@@ -234,7 +266,7 @@ def test_the_second_order_finds_the_gain_of_the_riccati_equation():
     mpc = QPMPC.from_model([[A]], [[B]], 2, gamma=gamma, solver="daqp", **cost)
     loss = QPQLearningLoss(QPActorValueOperator(mpc))
     loss.make_value_estimator(gamma=gamma)
-    update = second_order(mpc, loss, GaussNewton(mpc), None, None)
+    update = second_order(mpc, loss, GaussNewton(mpc), Penalties())
     x, noise = torch.linspace(-2, 2, 5).double(), torch.tensor([-0.3, 0.3]).double()
     s, a, w = (part.reshape(-1, 1) for part in torch.meshgrid(x, x, noise, indexing="ij"))
     done = torch.zeros(len(s), 1, dtype=torch.bool)
@@ -250,6 +282,6 @@ def test_the_second_order_keeps_active_sets():
     loss = make_loss(mpc, ACTIVE_SET)
     batch = transitions()
     expected = mpc.solve(batch["observation"], batch["action"]).active
-    second_order(mpc, loss, GaussNewton(mpc), None, None)(batch, None)
+    second_order(mpc, loss, GaussNewton(mpc), Penalties())(batch, None)
     assert torch.equal(batch[ACTIVE_SET], expected)
     assert ACTIVE_SET in batch["next"]

@@ -25,6 +25,7 @@ from torch_qpmpc import (
     QPQLearningLoss,
     SystemIdentificationPenalty,
 )
+from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.updates import first_order
 
 HORIZON, N_Z = 3, 11
@@ -97,7 +98,7 @@ def test_the_proximal_step_of_an_update_leaves_frozen_entries():
     loss.make_value_estimator(gamma=0.9)
     groups = mpc.parameter_groups({"cost": 0.0, "constraints": 0.0})
     penalty = DeviationPenalty(mpc, c_1=0.1, c_2=0.1, c_3=0.1)
-    update = first_order(mpc, loss, torch.optim.SGD(groups, lr=0.0), penalty, None)
+    update = first_order(mpc, loss, torch.optim.SGD(groups, lr=0.0), Penalties(penalty))
     C = mpc.C.detach().clone()
     update(make_batch(4), None)
     moves(mpc, C, mask)

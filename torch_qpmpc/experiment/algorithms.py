@@ -27,7 +27,7 @@ from torch_qpmpc.learning.operators import (
     in_closed_loop,
     preview_key,
 )
-from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.learning.penalties import DeviationPenalty, Penalties, SystemIdentificationPenalty
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.replay import ACTIVE_SET, Replay
 from torch_qpmpc.learning.updates import Update, first_order, second_order
@@ -42,7 +42,7 @@ class Learner:
         learn: updates theta from a batch.
         loss_module: the loss.
         actor: maps observation to action, without exploration.
-        deviation, si: the penalties; None if off.
+        penalties: those that are on.
         n_preview: entries of the preview, with which p begins.
     """
 
@@ -51,8 +51,7 @@ class Learner:
     actor: TensorDictModuleBase
     optimizer: torch.optim.Optimizer
     scheduler: LambdaLR
-    deviation: DeviationPenalty | None
-    si: SystemIdentificationPenalty | None
+    penalties: Penalties
     n_preview: int = 0
 
     @property
@@ -83,27 +82,25 @@ def make_learner(cfg: Config, operator: QPActorValueOperator) -> Learner:
     optimizer: Any = make_optimizer(cfg, mpc)
     scheduler = make_scheduler(cfg, optimizer)
     make = second_order if isinstance(optimizer, GaussNewton) else first_order
-    update = make(mpc, loss_module, optimizer, *penalties)
+    update = make(mpc, loss_module, optimizer, penalties)
     return Learner(
         update,
         loss_module,
         operator.get_policy_operator(POLICY_ACTIVE_SET),
         optimizer,
         scheduler,
-        *penalties,
+        penalties,
         n_preview=(mpc.horizon + 1) * mpc.n_d,
     )
 
 
-def make_penalties(
-    cfg: Config, mpc: QPMPC
-) -> tuple[DeviationPenalty | None, SystemIdentificationPenalty | None]:
-    """Make the deviation and the SI penalty; None for each that is off."""
+def make_penalties(cfg: Config, mpc: QPMPC) -> Penalties:
+    """Make the penalties of a run."""
     own, si = cfg.constraint.deviation, cfg.constraint.si
     own = own if mpc.sequential is None else None  # no C is learned
-    return (
-        own and DeviationPenalty(mpc, c_1=own.c_1, c_2=own.c_2, c_3=own.c_3),
-        si and SystemIdentificationPenalty(si.beta),
+    return Penalties(
+        deviation=own and DeviationPenalty(mpc, c_1=own.c_1, c_2=own.c_2, c_3=own.c_3),
+        si=si and SystemIdentificationPenalty(si.beta),
     )
 
 
@@ -116,8 +113,6 @@ def make_optimizer(cfg: Config, mpc: QPMPC) -> torch.optim.Optimizer:
             scales={"cost": 1.0, "constraints": options.scale_constraints},
             lr=options.lr,
             damping=options.damping,
-            td_error_clip=cfg.td_error_clip,
-            weighted=cfg.weighted,
         )
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     groups = mpc.parameter_groups(rates)

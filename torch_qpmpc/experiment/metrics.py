@@ -110,8 +110,8 @@ def update_metrics(
         f"train/{name}": x.double().mean().item() for name, x in losses.items() if name in LOGGED
     }
     metrics |= tally.metrics() | theta_metrics(mpc)
-    if learner.deviation is not None:
-        metrics.setdefault("loss/deviation", learner.deviation(mpc.C).item())
+    if learner.penalties.deviation is not None:
+        metrics["loss/deviation"] = learner.penalties.deviation(mpc.C).item()
     began, collected, ended = times
     return metrics | {"time/collect": collected - began, "time/update": ended - collected}
 

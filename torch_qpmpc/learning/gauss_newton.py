@@ -58,16 +58,14 @@ class StepReport:
         damping: mu as a fraction of the mean of K's diagonal, as used by the step.
         ratio: actual over predicted decrease of the objective; nan without a trust region.
         accepted: True if theta has moved.
-        unsolved: number of pairs left out because their QP has no solution.
-        without_target: number of other pairs left out because their target is not finite.
+        usable: True for pairs with a solution and a finite target, ``(B,)``.
         solution: the solution of Q(s, a) before the step.
     """
 
     damping: float
     ratio: float
     accepted: bool
-    unsolved: int
-    without_target: int
+    usable: Tensor
     solution: QPSolution
 
 
@@ -85,11 +83,9 @@ class GaussNewton(torch.optim.Optimizer):
         lr: the initial fraction, in (0, 1].
         damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
             on it. A larger one makes a step less sensitive to its batch's noise.
-        td_error_clip: bound on the absolute TD error; none by default.
         trust_region: solve the batch again after each step and its projection; undo a step that
             raised the squared errors or left a QP unsolved, and adapt the damping to actual over
             predicted decrease. Five of them in a row are a `RuntimeWarning`.
-        weighted: multiply each pair's ``1/2 delta^2`` by `inverse_variance`.
 
     Raises:
         QPError: if a number is out of range, or the scales do not fit the learned parts.
@@ -114,26 +110,19 @@ class GaussNewton(torch.optim.Optimizer):
         scales: Mapping[str, float] | None = None,
         lr: float = 1.0,
         damping: float = 0.03,
-        td_error_clip: float | None = None,
         trust_region: bool = True,
-        weighted: bool = False,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
         check_number("lr", lr, lambda x: 0 < x <= 1, "a number in (0, 1]")
         check_number("damping", damping, _positive, "a finite number > 0")
-        if td_error_clip is not None:
-            check_number("td_error_clip", td_error_clip, _positive, "a finite number > 0")
         check_flag("trust_region", trust_region)
-        check_flag("weighted", weighted)
         groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
             group |= {"scale": group["lr"], "lr": lr, "damping": damping, **FRESH}
         super().__init__(groups, {})
-        self._mpc, self._least_damping = mpc, damping
-        self._clip, self._trust_region = td_error_clip, trust_region
-        self._weighted = weighted
+        self._mpc, self._least_damping, self._trust_region = mpc, damping, trust_region
 
     @without_gradients
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -142,6 +131,9 @@ class GaussNewton(torch.optim.Optimizer):
         a: Tensor,
         target: Tensor,
         *,
+        weights: Tensor | None = None,
+        clip: float | None = None,
+        weighted: bool = False,
         penalty: Tensor | None = None,
         warm_start: Tensor | None = None,
     ) -> StepReport:
@@ -150,8 +142,11 @@ class GaussNewton(torch.optim.Optimizer):
         Args:
             s, a: visited pairs, ``(B, n_p)`` and ``(B, n_u)``.
             target: costs to go, L + gamma V(s+), ``(B,)``. Pairs with a target that is not finite
-                are left out and counted; if none is left, theta stays, with a `RuntimeWarning`.
-                The sign is not checked: negate rewards and TorchRL's values.
+                are left out; if none is left, theta stays, with a `RuntimeWarning`. The sign
+                is not checked: negate rewards and TorchRL's values.
+            weights: of each pair's ``1/2 delta^2``, ``(B,)``, relative to their mean.
+            clip: bound on the absolute TD errors delta.
+            weighted: multiply the weights by `inverse_variance`.
             penalty: S ``(n_z + 1, n_z + 1)`` of a penalty ``1/2 tr([C, b] S [C, b]')`` added to the
                 batch's mean of ``1/2 delta^2``, such as `SystemIdentificationPenalty.curvature`;
                 for a free C without a mask only, which it moves, and not b.
@@ -166,23 +161,27 @@ class GaussNewton(torch.optim.Optimizer):
         """
         self._check_parameters()
         self._check_batch(s, a, target, penalty)
+        weights = torch.ones_like(target) if weights is None else weights
+        check_tensor("weights", weights, len(s), batched=False)
+        if clip is not None:
+            check_number("clip", clip, _positive, "a finite number > 0")
         lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
         solution = self._mpc.solve(s, a, warm_start, qp)
-        use, left_out = usable(solution.solved, target)
+        use = usable(solution.value, target)
 
         def report(ratio: float, accepted: bool) -> StepReport:
-            return StepReport(damping, ratio, accepted, *left_out, solution)
+            return StepReport(damping, ratio, accepted, use, solution)
 
-        count = len(s) - sum(left_out)
-        if not count:
+        count, root = int(use.sum()), torch.where(use, weights, 0).to(solution.value)
+        if not root.any():
             return report(math.nan, False)
+        root = (count * root / root.sum()).sqrt()
         delta = torch.where(use, target.to(solution.value) - solution.value, 0)
-        if self._clip is not None:
-            delta = delta.clamp(-self._clip, self._clip)
-        root = use.to(delta)
-        if self._weighted:
+        if clip is not None:
+            delta = delta.clamp(-clip, clip)
+        if weighted:
             root = root * inverse_variance(s, a, solution.value, delta, use).sqrt()
         # The root of a weight scales its pair's row, both its error and its gradient.
         delta = root * delta

@@ -6,6 +6,8 @@ step.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -141,6 +143,13 @@ class SystemIdentificationPenalty(nn.Module):
         b = C.new_zeros(len(C)) if b is None else b
         check_tensor("b", b, len(C), batched=False, remedy="Pass mpc.b.")
         return self.beta * _single(windows.to(C.dtype) @ C.mT - b).square().sum()
+
+
+class Penalties(NamedTuple):
+    """The penalties of an update; None for each that is off."""
+
+    deviation: DeviationPenalty | None = None
+    si: SystemIdentificationPenalty | None = None
 
 
 def _check_windows(windows: Tensor, n_z: int | str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from torch_qpmpc.learning.td_error import (
     inverse_variance,
     td_loss,
     td_metadata,
+    usable,
 )
 from torch_qpmpc.qp.tracing import has_values
 
@@ -132,8 +133,8 @@ class QPQLearningLoss(LossModule):
             remedy = "Wrap the QPMPC: QPActorValueOperator(mpc)."
             raise QPError.expected("value_network", got, "a QPActorValueOperator", remedy)
         if td_error_clip is not None:
-            expected = "a positive number or None"
-            check_number("td_error_clip", td_error_clip, lambda x: x > 0, expected)
+            expected = "a finite number > 0, or None"
+            check_number("td_error_clip", td_error_clip, lambda x: 0 < x < math.inf, expected)
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
         check_flag("delay_value", delay_value)
@@ -243,25 +244,13 @@ class QPQLearningLoss(LossModule):
             QPError: if an entry is missing, does not fit, or holds weights that are not finite.
         """
         self._check_batch(tensordict)
-        weights = self._maybe_get_priority_weight(tensordict)
-        if weights is not None and has_values(weights) and not weights.isfinite().all():
-            name = str(self.tensor_keys.priority_weight)
-            raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
         visited = self._visited(tensordict)
         if (active_set := self.operator.active_set_key) is not None:
             tensordict.set(active_set, visited.get(active_set))
         prediction = visited[self.tensor_keys.state_action_value].squeeze(-1)
         target = self.target(tensordict)
-        metadata = td_metadata(prediction.detach(), target)
-        # An unsolved QP's cost is infinite, the target of an invalid reward is NaN.
-        use = prediction.isfinite() & target.isfinite()
-        if has_values(use) and not use.any():
-            unsolved, invalid = int(metadata["unsolved"]), int(metadata["invalid_reward"])
-            message = (
-                f"None of the batch's {use.numel()} transitions is usable: {unsolved} without a "
-                f"QP solution, {invalid} with an invalid reward. The loss is zero."
-            )
-            warnings.warn(message, RuntimeWarning, stacklevel=2)
+        use = usable(prediction, target)
+        metadata = td_metadata(prediction.detach(), target, use)
         prediction = torch.where(use, prediction, 0)
         target = torch.where(use, target, 0)
         priority = (target - prediction).detach().square()
@@ -272,7 +261,16 @@ class QPQLearningLoss(LossModule):
             pairs = self.operator.known(flat), flat.get(self.operator.in_keys[1])
             rest = (x.reshape(-1) for x in (prediction.detach(), error, use))
             loss = inverse_variance(*pairs, *rest).view_as(loss) * loss
+        weights = self.priority_weights(tensordict)
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
+
+    def priority_weights(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the samples' priority weights ``(*batch,)``; None without."""
+        weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None and has_values(weights) and not weights.isfinite().all():
+            name = str(self.tensor_keys.priority_weight)
+            raise QPError.expected(name, "NaN or inf", "finite weights", "Check the priorities.")
+        return weights
 
     def _visited(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the entries that Q reads, with -Q(s, a) and, if it has a key, its active set."""
@@ -334,7 +332,7 @@ class QPQLearningLoss(LossModule):
         reward = batch.get(("next", self.tensor_keys.reward))
         target = self._estimate(batch, reward, value)
         factor = self._estimate(batch, torch.zeros_like(reward), (~terminated).to(value))
-        use = prediction.isfinite() & target.isfinite()
+        use = usable(prediction, target)
         lost = (1 - factor)[use].sum()
         # Where gamma is 1, rounding is left.
         if not lost > 1e-6 * use.sum():

@@ -36,8 +36,7 @@ def windows_to_tau(windows: TensorDictBase, preview_key: NestedKey | None = None
     ``windows`` are ``(M, N)`` consecutive transitions along the last dimension. With a
     ``preview_key``, p is the preview and the observation.
     """
-    known = ["observation"] if preview_key is None else [preview_key, "observation"]
-    p = [windows[key][..., 0, :] for key in known]
+    p = [windows[x][..., 0, :] for x in (preview_key, "observation") if x is not None]
     pairs = torch.cat([windows["action"], windows["next", "observation"]], dim=-1)
     return torch.cat([*p, pairs.flatten(-2)], dim=-1)
 
@@ -50,8 +49,8 @@ def walk(steps: TensorDictBase, preview_key: NestedKey | None = None) -> float:
     So the noise is a walk if the model of changes leaves less than half of the variance, in the
     geometric mean over the states. A variance below `EXACT` times a state's counts as zero.
     """
-    known = ["observation"] if preview_key is None else [preview_key, "observation"]
-    x = torch.cat([steps[key].double() for key in (*known, "action")], -1)
+    keys = (preview_key, "observation", "action")
+    x = torch.cat([steps[key].double() for key in keys if key is not None], -1)
     s, y = steps["observation"].double(), steps["next", "observation"].double()
     follows = (y[:, :-1] == s[:, 1:]).all(-1)  # neither an end nor the ring's seam is between
     changes = x.diff(dim=1)[follows], y.diff(dim=1)[follows]

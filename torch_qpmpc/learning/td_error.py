@@ -21,24 +21,22 @@ FLOOR = 0.01
 #: Smallest batch to which the variance is fitted.
 LEAST = 16
 #: Deviations below this fraction of an input are rounding; keeps collinear inputs apart, too.
-TINY = 1e-9
+TINY, SMALLEST = 1e-9, torch.finfo(torch.float64).tiny
 
 
-def usable(solved: Tensor, target: Tensor) -> tuple[Tensor, tuple[int, int]]:
-    """Return True for pairs ``(B,)`` with a solution and a finite target, and how many lack each.
+def usable(value: Tensor, target: Tensor) -> Tensor:
+    """Return True for pairs with a finite Q, as of a solved QP, and a finite target, ``(*batch,)``.
 
-    A pair that lacks both counts as unsolved. If none is left, a `RuntimeWarning` says so.
+    If none is left, a `RuntimeWarning` says so.
     """
+    solved = value.isfinite()
     use = solved & target.isfinite()
-    unsolved = int((~solved).sum())
-    left_out = unsolved, len(use) - unsolved - int(use.sum())
-    if sum(left_out) == len(use):
-        message = (
-            f"None of the {len(use)} pairs is usable: {unsolved} without a QP solution, "
-            f"{left_out[1]} without a finite target. Theta stays unchanged."
-        )
+    if has_values(use) and not use.any():
+        count, found = use.numel(), int(solved.sum())
+        message = f"None of the {count} pairs is usable: {count - found} without a QP solution, "
+        message += f"{found} without a finite target. Theta stays unchanged."
         warnings.warn(message, RuntimeWarning, stacklevel=3)
-    return use, left_out
+    return use
 
 
 def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Tensor:
@@ -52,12 +50,11 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
     return F.huber_loss(prediction, target, reduction="none", delta=clip)
 
 
-def td_metadata(prediction: Tensor, target: Tensor) -> dict[str, Tensor]:
+def td_metadata(prediction: Tensor, target: Tensor, use: Tensor) -> dict[str, Tensor]:
     """Return detached scalars that describe a batch of values and their targets, ``(*batch,)``.
 
-    NaN targets are left out and counted as invalid rewards, others that are not finite as unsolved.
+    Without ``use``, NaN targets count as invalid rewards, and other pairs as unsolved.
     """
-    use = prediction.isfinite() & target.isfinite()
     invalid = target.isnan()
     prediction, target = torch.where(use, prediction, 0), torch.where(use, target, 0)
 
@@ -100,7 +97,7 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
     if len(square) < LEAST or not square.any():
         return weight
     inputs = _square(p), _square(a), value.abs()
-    logs = [torch.log(OFFSET + x / _positive(x.mean())) for x in inputs]
+    logs = [torch.log(OFFSET + x / x.mean().clamp(min=SMALLEST)) for x in inputs]
     features = F.pad(torch.stack(logs, -1), (1, 0), value=1.0)
     offset = FLOOR * square.median() + TINY * square.mean()
     gram = features.mT @ features + TINY * len(square) * torch.eye(4).to(square)
@@ -114,10 +111,5 @@ def inverse_variance(p: Tensor, a: Tensor, value: Tensor, error: Tensor, use: Te
 def _square(x: Tensor) -> Tensor:
     """Return the mean square of each row's standardised entries, ``(B,)``."""
     deviation = x - x.mean(0)
-    least = _positive((TINY * x).square().amax(0))
+    least = (TINY * x).square().amax(0).clamp(min=SMALLEST)
     return (deviation.square() / deviation.square().mean(0).maximum(least)).mean(-1)
-
-
-def _positive(x: Tensor) -> Tensor:
-    """Return x, and one in place of zero."""
-    return torch.where(x > 0, x, 1.0)

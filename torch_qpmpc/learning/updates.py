@@ -9,14 +9,16 @@ batch without a usable transition leaves theta and the optimiser's state unchang
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.optim import Optimizer
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.gauss_newton import GaussNewton
-from torch_qpmpc.learning.penalties import DeviationPenalty, SystemIdentificationPenalty
+from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.td_error import td_loss, td_metadata
 from torch_qpmpc.mpc.module import QPMPC
@@ -28,27 +30,22 @@ Update = Callable[[TensorDictBase, Tensor | None], tuple[dict[str, Tensor], Scal
 
 
 def first_order(
-    mpc: QPMPC,
-    loss_module: QPQLearningLoss,
-    optimizer: torch.optim.Optimizer,
-    deviation: DeviationPenalty | None,
-    si: SystemIdentificationPenalty | None,
+    mpc: QPMPC, loss_module: QPQLearningLoss, optimizer: Optimizer, penalties: Penalties
 ) -> Update:
     """Return an update by a torch optimiser on the gradient of the loss and the penalties.
 
-    A loss or gradient that is not finite changes nothing either. Penalties that are None are off.
+    A loss or gradient that is not finite changes nothing either.
 
     Raises:
-        QPError: the SI penalty is of one C for all states, and the QPMPC has dynamics.
+        QPError: C is penalised, but the optimiser does not move it, or the QPMPC has dynamics.
     """
-    if si is not None:
-        check_one_model(mpc)
+    pull = _proximal(mpc, optimizer, penalties)
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         losses = loss_module(batch)
         terms = {"loss/value": losses["loss_value"]}
-        if si is not None and windows is not None:
-            terms["loss/si"] = si(mpc.C, windows, mpc.b.detach())
+        if penalties.si is not None and windows is not None:
+            terms["loss/si"] = penalties.si(mpc.C, windows, mpc.b.detach())
         total = torch.stack([*terms.values()]).sum()
         moves = losses["unsolved"] + losses["invalid_reward"] < batch.numel() and total.isfinite()
         optimizer.zero_grad()
@@ -59,8 +56,7 @@ def first_order(
         if moves:
             optimizer.step()
             mpc.project_()
-            if deviation is not None:
-                deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
+            pull()
         terms["train/accepted"] = torch.tensor(float(moves))
         return terms, losses
 
@@ -68,23 +64,18 @@ def first_order(
 
 
 def second_order(
-    mpc: QPMPC,
-    loss_module: QPQLearningLoss,
-    optimizer: GaussNewton,
-    deviation: DeviationPenalty | None,
-    si: SystemIdentificationPenalty | None,
+    mpc: QPMPC, loss_module: QPQLearningLoss, optimizer: GaussNewton, penalties: Penalties
 ) -> Update:
-    """Return an update by a `GaussNewton` step towards the loss module's targets.
+    """Return an update by a `GaussNewton` step on the loss module's loss.
 
     The SI penalty and the projection are part of that step; the deviation penalty's proximal step
-    follows, even if that step is not accepted. Penalties that are None are off.
+    follows, even if that step is not accepted.
 
     Raises:
-        QPError: the value network has other modules or ``theta_keys``: the step's curvature is that
-            of the QP's own theta. Or the QPMPC has dynamics and an SI penalty.
+        QPError: as `first_order`; or the value network has other modules or ``theta_keys``: the
+            step's curvature is that of the QP's own theta.
     """
-    if si is not None:
-        check_one_model(mpc)
+    pull = _proximal(mpc, optimizer, penalties)
     network = loss_module.operator
     if loss_module.value_network is not network or network.theta_keys:
         remedy = "Learn with first_order and a torch optimiser."
@@ -93,37 +84,49 @@ def second_order(
 
     def update(batch: TensorDictBase, windows: Tensor | None) -> tuple[dict[str, Tensor], Scalars]:
         target, terms, penalty = loss_module.target(batch).reshape(-1), {}, None
-        if si is not None and windows is not None:
-            penalty = si.curvature(windows)
-            terms["loss/si"] = si(mpc.C, windows, mpc.b)
+        if penalties.si is not None and windows is not None:
+            penalty = penalties.si.curvature(windows)
+            terms["loss/si"] = penalties.si(mpc.C, windows, mpc.b)
         key, pairs = network.active_set_key, batch.reshape(-1)
         start = None if key is None else pairs.get(key, None)
-        p, a = network.known(pairs), pairs.get(network.in_keys[1])
-        report = optimizer.step(p, a, -target, penalty=penalty, warm_start=start)
+        p, a, clip = network.known(pairs), pairs.get(network.in_keys[1]), loss_module.td_error_clip
+        own: Any = {"weights": loss_module.priority_weights(pairs), "warm_start": start}
+        own |= {"clip": clip, "weighted": loss_module.weighted, "penalty": penalty}
+        report = optimizer.step(p, a, -target, **own)
         if key is not None:
             batch.set(key, report.solution.active.view(*batch.shape, -1))
-        prediction = -report.solution.value.to(target)
-        losses = td_metadata(prediction, target)
-        solved = prediction.isfinite() & target.isfinite()
-        if deviation is not None and solved.any():
-            deviation.proximal_step_(entries_of_C(mpc), share_of_rate(optimizer))
-        elementwise = td_loss(prediction, target, loss_module.td_error_clip)
-        terms["loss/value"] = elementwise[solved].sum() / solved.sum().clamp(min=1)
+        prediction, use = -report.solution.value.to(target), report.usable
+        if use.any():
+            pull()
+        elementwise = td_loss(prediction, target, clip)
+        terms["loss/value"] = elementwise[use].sum() / use.sum().clamp(min=1)
         terms["train/damping"] = torch.tensor(report.damping, dtype=torch.float64)
         terms["train/accepted"] = torch.tensor(float(report.accepted))
-        return terms, losses
+        return terms, td_metadata(prediction, target, use)
 
     return update
 
 
-def entries_of_C(mpc: QPMPC) -> Tensor:
-    """Return C, or its parameter if only some of its entries are learned."""
-    parameter = matrix(mpc, "C")
-    return mpc.C if parameter is None else parameter
+def _proximal(mpc: QPMPC, optimizer: Optimizer, penalties: Penalties) -> Callable[[], None]:
+    """Return the deviation penalty's proximal step; raise `QPError` if the penalties do not fit."""
+    if penalties.si is not None:
+        check_one_model(mpc)
+    if (deviation := penalties.deviation) is None:
+        return lambda: None
+    rate_of_C(mpc, optimizer)
+    return lambda: deviation.proximal_step_(*rate_of_C(mpc, optimizer))
 
 
-def share_of_rate(optimizer: torch.optim.Optimizer) -> float:
-    """Return C's learning rate over its initial one, 1 without a schedule: the penalty's scale."""
-    group = next(group for group in optimizer.param_groups if group["name"] == "C")
+def rate_of_C(mpc: QPMPC, optimizer: Optimizer) -> tuple[Tensor, float]:
+    """Return C's parameter, and its learning rate over the initial one, 1 without a schedule.
+
+    Raises:
+        QPError: the optimiser does not move a C that is free.
+    """
+    C = matrix(mpc, "C")
+    groups = (x for x in optimizer.param_groups if any(C is leaf for leaf in x["params"]))
+    if C is None or (group := next(groups, None)) is None:
+        want = "one that moves a free C, which is penalised"
+        raise QPError.expected("optimizer", "one that does not move C", want)
     initial = group.get("initial_lr", 0.0)
-    return group["lr"] / initial if initial else 1.0
+    return C, group["lr"] / initial if initial else 1.0
