@@ -14,6 +14,9 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 
+POSITIVE: Any = (lambda x: 0 < x < float("inf"), "a finite number > 0")
+NONNEGATIVE: Any = (lambda x: 0 <= x < float("inf"), "a finite number >= 0")
+
 
 def class_name(value: Any) -> str:
     """Return the name of a value's class, without torch's prefix if it has parametrizations."""

@@ -223,7 +223,7 @@ def test_the_state_is_restored():
     ("call", "message"),
     [
         (lambda: PairedTest(0.0), "alpha"),
-        (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a positive loss of one pair"),
+        (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a finite number > 0"),
         (lambda: Gate(Policy(1.0), costs, bound=0.0), "bound"),
         (lambda: Gate(Policy(1.0), costs, decisions=0), "decisions"),
         (lambda: PairedTest().add(torch.zeros(2, 2)), "differences"),

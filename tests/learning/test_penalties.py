@@ -123,7 +123,7 @@ def test_proximal_step_reaches_C_0_exactly(generator):
 @pytest.mark.parametrize("name", ["c_1", "c_2", "c_3"])
 @pytest.mark.parametrize("weight", [-1.0, math.inf, math.nan])
 def test_impossible_deviation_weights(name, weight):
-    with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite weight >= 0"):
+    with pytest.raises(QPError, match=rf"{name}: got {weight}, expected a finite number >= 0"):
         DeviationPenalty(drawn_mpc(1, 1, 3), **{name: weight})
 
 

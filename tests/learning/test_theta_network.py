@@ -219,7 +219,7 @@ def test_the_network_reads_other_keys():
         (lambda mpc: ThetaNetwork(mpc, ["q"]), "sizes: got list, expected a Mapping. Map names"),
         (lambda mpc: ThetaNetwork(mpc, {}), "sizes: got {}, expected bounds of some of H, q, c"),
         (lambda mpc: ThetaNetwork(mpc, {"A": 1.0}), "sizes: got 'A', expected names among H, q"),
-        (lambda mpc: ThetaNetwork(mpc, {"q": 0.0}), r"sizes\['q'\]: got 0.0, expected a n"),
+        (lambda mpc: ThetaNetwork(mpc, {"q": 0.0}), r"sizes\['q'\]: got 0.0, expected a f"),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
         (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
         (

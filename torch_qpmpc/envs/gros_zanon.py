@@ -8,14 +8,13 @@ package mpcrl uses it in its example of on-policy Q-learning.
 
 from __future__ import annotations
 
-import math
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_number, check_tensor
+from torch_qpmpc.checks import NONNEGATIVE, check_number, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemGymEnv,
@@ -56,7 +55,7 @@ class GrosZanonLTI(LinearSystem):
     def __post_init__(self) -> None:
         super().__post_init__()
         remedy = "Pass 0 for a cost without the violation."
-        check_number("w", self.w, lambda x: 0 <= x < math.inf, "a finite number >= 0", remedy)
+        check_number("w", self.w, *NONNEGATIVE, remedy)
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, with a clipped."""

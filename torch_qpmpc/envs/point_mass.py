@@ -5,7 +5,6 @@ s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 
 from __future__ import annotations
 
-import math
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_choice, check_number, check_seed, check_tensor
+from torch_qpmpc.checks import NONNEGATIVE, check_choice, check_number, check_seed, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
     LinearSystemEnv,
@@ -27,10 +26,6 @@ from torch_qpmpc.envs.linear_system import (
 
 #: Standard deviation of the noise by kind, which the paper does not specify.
 NOISE_STD = {"gaussian": 0.01, "brownian": 0.002}
-
-
-def _finite(x: float) -> bool:
-    return 0 <= x < math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +76,10 @@ class PointMass(LinearSystem):
         super().__post_init__()
         check_tensor("W", self.W, *self.A.shape, batched=False)
         for name in ("start_position", "start_velocity"):
-            check_number(name, getattr(self, name), _finite, "a finite number >= 0")
+            check_number(name, getattr(self, name), *NONNEGATIVE)
         check_choice("noise_kind", self.noise_kind, tuple(NOISE_STD))
         remedy = "Pass 0 for no noise, None for the default."
-        check_number("noise_std", self.std, _finite, "a finite number >= 0", remedy)
+        check_number("noise_std", self.std, *NONNEGATIVE, remedy)
 
     @property
     def std(self) -> float:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LinearLR
 
-from torch_qpmpc.checks import check_kind, check_number, check_seed, check_whole
+from torch_qpmpc.checks import POSITIVE, check_kind, check_number, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
@@ -508,7 +508,7 @@ def improve(
     own = {"updates": updates, "loops": loops, "steps": steps, "window": window, "members": members}
     for name, size in own.items():
         check_whole(name, size, 1)
-    check_number("rate", rate, lambda x: 0 < x < math.inf, "a positive rate")
+    check_number("rate", rate, *POSITIVE)
     check_seed(seed)
     if isinstance(plant, Identified):
         plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), mpc.horizon, members, seed)

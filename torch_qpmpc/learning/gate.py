@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_number, check_seed, check_tensor, check_whole
+from torch_qpmpc.checks import POSITIVE, check_number, check_seed, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.validation import without_gradients
 
@@ -66,7 +66,7 @@ class PairedTest:
     def __init__(self, alpha: float = 0.05, bound: float | None = None) -> None:
         check_number("alpha", alpha, lambda x: 0 < x < 1, "a probability in (0, 1)")
         if bound is not None:
-            check_number("bound", bound, lambda x: 0 < x < math.inf, "a positive loss of one pair")
+            check_number("bound", bound, *POSITIVE)
         self.alpha, self._given, self._d = alpha, bound, np.zeros(0)
 
     @without_gradients

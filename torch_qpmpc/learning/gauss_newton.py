@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_flag, check_kind, check_number, check_tensor
+from torch_qpmpc.checks import POSITIVE, check_flag, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.kernel import (
     FRESH,
@@ -46,10 +46,6 @@ RISE, FALL, MAX_DAMPING = 4.0, 0.5, 1e6
 STALLED, FIRST = 5, 16
 
 
-def _positive(x: float) -> bool:
-    return 0 < x < math.inf
-
-
 @dataclass(frozen=True)
 class StepReport:
     """The outcome of a `GaussNewton.step`.
@@ -65,7 +61,7 @@ class StepReport:
     damping: float
     ratio: float
     accepted: bool
-    usable: Tensor
+    usable: Tensor = field(repr=False)
     solution: QPSolution
 
 
@@ -115,11 +111,11 @@ class GaussNewton(torch.optim.Optimizer):
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
         check_number("lr", lr, lambda x: 0 < x <= 1, "a number in (0, 1]")
-        check_number("damping", damping, _positive, "a finite number > 0")
+        check_number("damping", damping, *POSITIVE)
         check_flag("trust_region", trust_region)
         groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
         for group in groups:
-            check_number(f"scales[{group['name']}]", group["lr"], _positive, "a finite number > 0")
+            check_number(f"scales[{group['name']}]", group["lr"], *POSITIVE)
             group |= {"scale": group["lr"], "lr": lr, "damping": damping, **FRESH}
         super().__init__(groups, {})
         self._mpc, self._least_damping, self._trust_region = mpc, damping, trust_region
@@ -164,7 +160,7 @@ class GaussNewton(torch.optim.Optimizer):
         weights = torch.ones_like(target) if weights is None else weights
         check_tensor("weights", weights, len(s), batched=False)
         if clip is not None:
-            check_number("clip", clip, _positive, "a finite number > 0")
+            check_number("clip", clip, *POSITIVE)
         lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()

@@ -12,16 +12,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torch_qpmpc.checks import check_kind, check_number, check_tensor
+from torch_qpmpc.checks import NONNEGATIVE, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
 
 WINDOWS_REMEDY = "Sample N consecutive transitions: s_j, a_j, .., s_{j+N}."
-
-
-def _finite(x: float) -> bool:
-    return 0 <= x < torch.inf
 
 
 class DeviationPenalty(nn.Module):
@@ -56,7 +52,7 @@ class DeviationPenalty(nn.Module):
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
-            check_number(name, weight, _finite, "a finite weight >= 0")
+            check_number(name, weight, *NONNEGATIVE)
         distance, mask = band_distance(mpc.layout).to(mpc.C_0), torch.full_like(mpc.C_0, c_2)
         mask[distance > 0], mask[distance < 0] = c_1, c_3
         self.register_buffer("C_0", mpc.C_0.detach().clone())
@@ -88,7 +84,7 @@ class DeviationPenalty(nn.Module):
                 "computed from A and B: call release() first."
             )
             raise QPError.expected("C", "a computed tensor", "a parameter", remedy)
-        check_number("scale", scale, _finite, "a finite number >= 0")
+        check_number("scale", scale, *NONNEGATIVE)
         excess = C - self.C_0
         C.copy_(self.C_0 + excess.sign() * (excess.abs() - scale * self.C_mask).clamp(min=0))
 
@@ -117,7 +113,7 @@ class SystemIdentificationPenalty(nn.Module):
 
     def __init__(self, beta: float = 1e-6) -> None:
         super().__init__()
-        check_number("beta", beta, _finite, "a finite weight >= 0")
+        check_number("beta", beta, *NONNEGATIVE)
         self.beta = beta
 
     def curvature(self, windows: Tensor) -> Tensor:

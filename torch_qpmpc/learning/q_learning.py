@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _GAMMA_LMBDA_DEPREC_ERROR, dispatch_value_estimator
 
-from torch_qpmpc.checks import check_flag, check_number, class_name
+from torch_qpmpc.checks import POSITIVE, check_flag, check_number, class_name
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import QPActorValueOperator, QPValueOperator
 from torch_qpmpc.learning.td_error import (
@@ -133,8 +132,7 @@ class QPQLearningLoss(LossModule):
             remedy = "Wrap the QPMPC: QPActorValueOperator(mpc)."
             raise QPError.expected("value_network", got, "a QPActorValueOperator", remedy)
         if td_error_clip is not None:
-            expected = "a finite number > 0, or None"
-            check_number("td_error_clip", td_error_clip, lambda x: 0 < x < math.inf, expected)
+            check_number("td_error_clip", td_error_clip, *POSITIVE)
         if reduction not in (None, "mean", "sum", "none"):
             raise QPError.expected("reduction", repr(reduction), "'mean', 'sum' or 'none'")
         check_flag("delay_value", delay_value)

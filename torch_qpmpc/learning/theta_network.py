@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.modules import MLP
 
-from torch_qpmpc.checks import check_kind, check_number, check_whole
+from torch_qpmpc.checks import POSITIVE, check_kind, check_number, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import PREVIEW, entry
 from torch_qpmpc.mpc.module import QPMPC
@@ -74,7 +74,7 @@ class ThetaNetwork(TensorDictModuleBase):
         if not sizes:
             raise QPError.expected("sizes", "{}", f"bounds of some of {', '.join(known)}")
         for name, size in sizes.items():
-            check_number(f"sizes[{name!r}]", size, lambda x: 0 < x < torch.inf, "a number > 0")
+            check_number(f"sizes[{name!r}]", size, *POSITIVE)
         self.sizes = {name: float(size) for name, size in sizes.items()}
         self.shapes = {name: known[name].shape for name in sizes}
         self.theta_keys: dict[str, NestedKey] = {name: ("theta", name) for name in sizes}
