@@ -31,7 +31,11 @@ def test_a_cell_says_on_how_many_seeds_improve_costs_less():
         for seed in range(10)
         for (design, x), bump in zip(J.items(), (0.01, 0.02, 0.01 * (-1) ** seed), strict=True)
     ]
+    for one in rows:
+        one["kept"] = one["seed"] > 2 if one["design"] == "improve" else None
     marks = compared(pd.DataFrame(rows))
     assert marks["one", "mean", 500] == "/10*"
     assert not marks["one", "Riccati", 500].endswith("*")
-    assert "| mean | 2.09/2.18/10* |" in shown(pd.DataFrame(rows))
+    text = shown(pd.DataFrame(rows))
+    assert "| mean | 2.09/2.18/10* |" in text
+    assert "| kept, dearer, most | 7/0/-50.0% |" in text
