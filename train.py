@@ -219,5 +219,5 @@ if __name__ == "__main__":
     try:
         main()
     except KeyboardInterrupt:
-        print("\nstopped", file=sys.stderr)
+        print("\nStopped: a sweep goes on with hydra.sweep.dir=FOLDER", file=sys.stderr)
         raise SystemExit(128 + signal.SIGINT) from None

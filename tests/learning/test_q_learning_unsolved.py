@@ -96,6 +96,22 @@ def test_without_masking_an_unsolved_qp_raises():
         make_loss(operator=operator)(td)
 
 
+def test_ctrl_c_reaches_the_caller_and_leaves_theta_in_its_place(monkeypatch):
+    operator, td = hard_operator(), feasible_batch(3)
+    loss = make_loss(operator=operator)
+    before, theta = loss(td.clone())["loss_value"], [*operator.parameters()]
+
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(QPActorValueOperator, "forward", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            loss(td.clone())
+    assert all(x is y for x, y in zip(operator.parameters(), theta, strict=True))
+    assert torch.equal(loss(td.clone())["loss_value"], before)
+
+
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_invalid_rewards_are_left_out_and_counted(bad, reduction):

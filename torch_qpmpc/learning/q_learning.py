@@ -406,7 +406,7 @@ def _call_with(
     with params.to_module(network, preserve_module_state=False):
         try:
             network(tensordict)
-        except Exception as error:
+        except BaseException as error:  # Ctrl-C, too
             failure = error
     if failure is not None:
         raise failure
