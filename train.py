@@ -215,7 +215,6 @@ def main() -> None:
 
 if __name__ == "__main__":
     gc.freeze()  # at the end, a search of all that was imported would take seconds
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main()
     except KeyboardInterrupt:

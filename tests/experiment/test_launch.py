@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import subprocess
 import sys
@@ -87,6 +88,21 @@ def test_ctrl_c_stops_at_once_and_names_the_command_that_goes_on(tmp_path, monke
     said = f"\nStopped: go on with python train.py {' '.join(overrides)} hydra.run.dir={tmp_path}\n"
     assert capsys.readouterr().out.endswith(said)
     assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 3
+
+
+def test_sigterm_stops_a_run_whatever_a_library_makes_of_it(tmp_path, monkeypatch):
+    """Compiled code makes a SystemError of it."""
+
+    def raised(*_: Any, **__: Any) -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        raise SystemError
+
+    monkeypatch.setattr("train.train", raised)
+    with pytest.raises(SystemExit) as ended:
+        run_command(*SMALL, f"hydra.run.dir={tmp_path}")
+    assert ended.value.code == 128 + signal.SIGINT
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_ctrl_c_is_left_to_the_launcher_of_a_sweep(tmp_path, monkeypatch):

@@ -145,9 +145,6 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
     def J(name: str) -> float:
         return costs[name].mean().item()
 
-    def error(x: Tensor) -> float:  # nan of one episode, without a warning
-        return (x.var(correction=0) / (len(x) - 1)).sqrt().item()
-
     for name in (*named, ZERO_ACTION):
         run(name)
     best, better = min(named, key=J), False
@@ -163,8 +160,9 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         run(best)
         run(ZERO_ACTION)
     chosen = best if better else ZERO_ACTION
+    error = {k: (x.var(correction=0) / (len(x) - 1)).sqrt().item() for k, x in costs.items()}
     rows = [
-        (len(x), J(name), error(x), steps * len(x), name == chosen) for name, x in costs.items()
+        (len(x), J(name), error[name], steps * len(x), name == chosen) for name, x in costs.items()
     ]
     table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions", "chosen"])
     return Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))

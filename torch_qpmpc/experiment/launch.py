@@ -84,12 +84,16 @@ def check_overrides(arguments: Sequence[str], configs: str | Path) -> None:
 def launched() -> Iterator[tuple[str, bool]]:
     """Lock the run's folder, yield it and True in a sweep, and exit with one sentence on an error.
 
-    After Ctrl-C it names the command that goes on. In a sweep both are raised instead, because an
-    exit would end the other runs. Warnings go to Hydra's train.log, too.
+    Ctrl-C and SIGTERM name the command that goes on; a sweep's runs raise. train.log gets warnings.
     """
-    hydra = HydraConfig.get()
-    sweep = hydra.mode is RunMode.MULTIRUN
-    folder = hydra.runtime.output_dir
+    hydra, stopped = HydraConfig.get(), []
+    sweep, folder = hydra.mode is RunMode.MULTIRUN, hydra.runtime.output_dir
+
+    def stop(signum: int, frame: Any) -> None:
+        stopped.append(signum)
+        signal.default_int_handler(signum, frame)
+
+    usual = {} if sweep else {x: signal.signal(x, stop) for x in (signal.SIGINT, signal.SIGTERM)}
     logging.captureWarnings(True)
     try:
         with locked(folder, f"{_key(sweep)}=FOLDER"):
@@ -101,13 +105,15 @@ def launched() -> Iterator[tuple[str, bool]]:
         if isinstance(error, OSError):
             error = unwritable(folder, error)
         raise SystemExit(str(error)) from None
-    except KeyboardInterrupt:
-        if sweep:
+    except BaseException as error:  # libraries make errors of their own of Ctrl-C
+        if sweep or not (stopped or isinstance(error, KeyboardInterrupt)):
             raise
         print(f"\nStopped: go on with {same_command(folder)}", flush=True)
         raise SystemExit(128 + signal.SIGINT) from None
     finally:
         logging.captureWarnings(False)
+        for signum, handler in usual.items():
+            signal.signal(signum, handler)
 
 
 @contextmanager
