@@ -29,15 +29,15 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 415,
+    ".": 417,
     "analysis": 851,
     "control": 4871,  # nonlinear plants
-    "envs": 1432,
+    "envs": 1427,
     "experiment": 2881,
     "export": 1500,
-    "learning": 2842,  # models that did not train theta decide in improve
+    "learning": 2833,  # models that did not train theta decide in improve
     "identification": 2633,
-    "mpc": 3897,
+    "mpc": 3895,
     "proofs": 1001,
     "qp": 5859,
     "study": 586,  # load_run(..).predict, which refinement's second start pays for

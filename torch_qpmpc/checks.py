@@ -14,8 +14,10 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 
-POSITIVE: Any = (lambda x: 0 < x < float("inf"), "a finite number > 0")
-NONNEGATIVE: Any = (lambda x: 0 <= x < float("inf"), "a finite number >= 0")
+#: What `check_number` accepts, and what it says.
+Accepted = tuple[Callable[[Any], bool], str]
+POSITIVE: Accepted = (lambda x: 0 < x < float("inf"), "a finite number > 0")
+NONNEGATIVE: Accepted = (lambda x: 0 <= x < float("inf"), "a finite number >= 0")
 
 
 def class_name(value: Any) -> str:

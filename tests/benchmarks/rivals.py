@@ -434,11 +434,11 @@ def main(arguments: Iterable[str] | None = None) -> None:
     options = parser.parse_args(None if arguments is None else list(arguments))
     torch.set_num_threads(1)
     rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
-    for seed, *own in product(options.seeds, options.plants, options.sizes):
-        key = dict(zip(("plant", "transitions", "seed"), (*own, seed), strict=True))
+    for seed, plant, size in product(options.seeds, options.plants, options.sizes):
+        key = dict(zip(("plant", "transitions", "seed"), (plant, size, seed), strict=True))
         done = rows[(rows[[*key]] == [*key.values()]).all(axis=1)]["design"] if len(rows) else ()
         if designs := [design for design in options.designs if design not in {*done}]:
-            rows = pd.concat([rows, pd.DataFrame([*run(*own, seed, designs)])])
+            rows = pd.concat([rows, pd.DataFrame([*run(plant, size, seed, designs)])])
             rows.to_csv(options.results, index=False, float_format="%.6g")
             print(rows.tail(len(designs)).to_string(header=False, index=False), flush=True)
     write_section(options.page, shown(rows), "rivals")

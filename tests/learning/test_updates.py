@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import cvxpy as cp
 import pytest
@@ -137,7 +138,8 @@ def test_an_update_without_a_usable_transition_moves_nothing(second):
     deviation = DeviationPenalty(mpc, c_2=1e-2, c_3=1e-2)
     batch, before = transitions(), copy.deepcopy(mpc.state_dict())
     batch["next", "reward"][:] = torch.inf
-    make, optimizer = first_order, torch.optim.SGD(mpc.parameters(), 1e-3)
+    make: Any = first_order
+    optimizer: Any = torch.optim.SGD(mpc.parameters(), 1e-3)
     if second:
         make, optimizer = second_order, GaussNewton(mpc)
     update = make(mpc, make_loss(mpc), optimizer, Penalties(deviation))

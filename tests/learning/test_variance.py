@@ -66,7 +66,8 @@ def test_few_pairs_or_errors_of_zero_have_weight_one():
 def test_equal_inputs_leave_the_weights_finite(dtype):
     p, a, value, use = (x[:32] for x in pairs())
     inputs = (0 * p, 0 * a, 0 * value + 1, a[:, 0])
-    weight = inverse_variance(*(x.to(dtype) for x in inputs), use)
+    p, a, value, error = (x.to(dtype) for x in inputs)
+    weight = inverse_variance(p, a, value, error, use)
     assert_close(weight, torch.ones(32, dtype=dtype))
 
 
@@ -74,5 +75,6 @@ def test_a_batch_in_float32_has_the_weights_of_float64():
     p, a, value, use = pairs()
     inputs = (p, a, value, a[:, 0] * normal(COUNT, seed=3))
     weight = inverse_variance(*inputs, use)
-    single = inverse_variance(*(x.float() for x in inputs), use)
+    p, a, value, error = (x.float() for x in inputs)
+    single = inverse_variance(p, a, value, error, use)
     assert_close(single, weight.float(), rtol=1e-3, atol=0)

@@ -268,6 +268,7 @@ def test_actions_are_within_hard_bounds_whatever_the_plan_was(low, high, iterati
     s = torch.linspace(-8, 8, 33).double()[:, None]
     for plan in (None, torch.full((33, 5, 1), 9.0).double()):
         solution = mpc.solve(s, warm_start=plan)
+        assert isinstance(solution, PlanSolution)
         assert solution.solved.all()
         u = solution.plan[solution.solved]
         assert (u >= low[0] - 1e-6).all()
@@ -293,11 +294,12 @@ def test_a_batch_may_have_its_own_prices_or_no_states():
 
 
 def test_a_module_may_have_attributes_of_any_name():
-    dynamics = Pendulum()
+    dynamics: Any = Pendulum()
     dynamics.arguments = {"gravity": 2.0}
     mpc = QPMPC.of(2, 1, 3, dynamics=dynamics, stage_weight=[1.0, 1.0, 0.1])
     mpc.reset_parameters()
-    assert copy.deepcopy(mpc).sequential.dynamics.arguments == {"gravity": 2.0}
+    twin: Any = copy.deepcopy(mpc).sequential
+    assert twin.dynamics.arguments == {"gravity": 2.0}
 
 
 def test_q_learning_moves_the_parameters_of_the_dynamics():

@@ -204,7 +204,7 @@ class Design:
     @property
     def zoned(self) -> Array:
         """Mask of the outputs with a bound, ``(n_y,)``."""
-        return np.isfinite(self.y_bounds).any(0) | (self.limited[0] >= 0).any(0)
+        return np.asarray(np.isfinite(self.y_bounds).any(0) | (self.limited[0] >= 0).any(0))
 
     @cached_property
     def ranged(self) -> Array:

@@ -85,10 +85,10 @@ class StateSpace:
         if self.dynamics is None:
             return self.A @ x + self.B @ u + self.E @ d + self.offset
         with torch.no_grad():
-            x = self.dynamics(*map(torch.from_numpy, (x, u, d)[: 2 + bool(len(d))]))
-        if isinstance(x, tuple):
+            after = self.dynamics(*map(torch.from_numpy, (x, u, d)[: 2 + bool(len(d))]))
+        if isinstance(after, tuple):
             raise QPError.expected("model", "a stage cost beside x+", "x+ alone", "Pass Q and R.")
-        return x.numpy()
+        return after.numpy()
 
     def at(self, point: Array) -> StateSpace:
         """Return the model linearised at another point; raise `QPError` if it is not finite."""
