@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import signal
 import subprocess
 import sys
@@ -63,6 +64,8 @@ def test_an_error_of_the_user_is_one_sentence(tmp_path, monkeypatch, caplog, err
         runtime=SimpleNamespace(output_dir=str(tmp_path)),
     )
     monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
+    # Hydra, in other tests, may have disabled it.
+    monkeypatch.setattr(logging.getLogger("py.warnings"), "disabled", False)
     with launched() as launch:
         assert launch == (str(tmp_path), False)
         with pytest.raises(QPError, match="in use"), locked(tmp_path, ""):

@@ -263,7 +263,7 @@ class QPQLearningLoss(LossModule):
         return self._reduce_loss(loss, tensordict=tensordict, weights=weights), metadata
 
     def priority_weights(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return the samples' priority weights ``(*batch,)``; None without."""
+        """Return the priority weights ``(*batch,)`` of a ``tensordict``; None without."""
         weights = self._maybe_get_priority_weight(tensordict)
         if weights is not None and has_values(weights) and not weights.isfinite().all():
             name = str(self.tensor_keys.priority_weight)
