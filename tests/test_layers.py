@@ -36,7 +36,7 @@ BUDGET = {
     "experiment": 2881,
     "export": 1500,
     "learning": 2833,  # models that did not train theta decide in improve
-    "identification": 2633,
+    "identification": 2638,
     "mpc": 3895,
     "proofs": 1001,
     "qp": 5859,

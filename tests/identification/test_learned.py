@@ -93,6 +93,21 @@ def test_known_signals_are_inputs_of_the_model():
     assert_close(model(x, u, d), x + 0.1 * u + torch.cat((d, 2 * d), -1))
 
 
+def test_a_set_point_in_the_outputs_is_held_and_a_quantised_output_is_not():
+    """The mean of jumps that nothing predicts would draw a plan's set-point to the middle."""
+    rng = np.random.default_rng(1)
+    u, r = rng.uniform(-1, 1, (900, 1)), rng.choice([-1.0, 0.0, 1.0], 46).repeat(20)[:901, None]
+    y = np.zeros((901, 1))
+    for t in range(900):
+        y[t + 1] = 0.98 * y[t] + 0.05 * u[t]
+    rough = np.round(20 * y) / 20
+    model = identify_nonlinear({"y": np.hstack((y, r, rough)), "u": u})
+    x = torch.tensor([[0.3, 1.0, 0.3], [-0.2, -1.0, -0.2]], dtype=torch.float64)
+    after = model(x, torch.zeros(2, 1, dtype=torch.float64))
+    assert_close(after[:, 1], x[:, 1], rtol=0, atol=1e-9)
+    assert (after[:, 2] - x[:, 2]).abs().max() > 1e-3
+
+
 def test_a_qpmpc_plans_with_the_model_and_is_saved_with_it(model, tmp_path):
     options: Any = {"stage_weight": [1e-3] * 3, "action_bounds": ([-2.0], [2.0])}
     mpc = QPMPC.of(2, 1, 8, dynamics=model, iterations=40, solver="daqp", gamma=1.0, **options)

@@ -28,6 +28,8 @@ COUNT, WIDTH, STEPS, RATE, BATCH = 5, 64, 2500, 3e-3, 128
 #: the cost of a nonlinear plant also near a tie with the quadratic; and none that the linear model
 #: leaves less of than this share of its variance.
 LEFT, TIED, EXACT = 0.9, 1.5, 1e-10
+#: What changes in fewer steps, and then by its own spread, is held, as a set-point is.
+RARE = 0.1
 
 
 class LearnedModel(nn.Module):
@@ -133,6 +135,9 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
     v, target, n_x = v.double(), (after - x).double(), x.shape[1]
     middle, size = v.mean(0), v.std(0, correction=0)
     size = torch.where(size > 1e-12 * v.abs().amax(0), size, 1.0)
+    often = (target != 0).double().mean(0)
+    held = (often < RARE) & (target.square().mean(0) > often * x.double().var(0))
+    target = target.masked_fill(held, 0.0)
     target = target if cost is None else torch.cat((target, cost.double().unsqueeze(-1)), -1)
     v = (v - middle) / size
     features = _features(v, cost is not None)
