@@ -41,6 +41,7 @@ from tests.benchmarks.table import DOCS
 from tests.runs import compose_config
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.experiment.choosing import LINEAR
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import zero_action
@@ -481,7 +482,9 @@ def outcomes(rows: Any) -> str:
         cells = ["" if math.isnan(x) else cost_text(x) for x in J]
         worse += int((runs["excess"] > ERRORS * runs["error"]).sum())
         count += len(runs)
-        names = (x.removesuffix(", first log").removeprefix("MPC of the ") for x in runs["chosen"])
+        of_x_N = f"{LINEAR}, "  # the names of the two linear ones begin alike
+        names = (x.removeprefix(of_x_N).replace("MPC of the ", "") for x in runs["chosen"])
+        names = (x.removesuffix(" MPC") for x in names)
         lines.append([name, *cells, "; ".join(dict.fromkeys(names))])
     head = ["plant", "zero action", "start, median", "worst", "reference", "chosen"]
     total = f"In {worse} of {count} runs the start cost more than zero action."

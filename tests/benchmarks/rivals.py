@@ -382,18 +382,15 @@ def shown(rows: Any) -> str:
 
     The last row has what `improve` kept, and the largest change of J by it.
     """
-    parts, marks = [], compared(rows)
-    for plant, own in rows.groupby("plant", sort=False):
-        sizes = sorted(own["transitions"].unique())
-        J = own.groupby(["design", "transitions"])["J"]
-        cells = {
-            key: f"{some.median():.3g}/{some.max():.3g}{marks.get((plant, *key), '')}"
-            for key, some in J
-        }
-        lines = [[x, *(cells.get((x, size), "") for size in sizes)] for x in own["design"].unique()]
-        lines.append(["kept, dearer, most", *(accepts(own, size) for size in sizes)])
-        parts.append(table([plant, *(f"{size:,}" for size in sizes)], lines))
-    return "\n\n".join(parts)
+    marks, cells, last = compared(rows), {}, {}
+    for (plant, size), own in rows.groupby(["plant", "transitions"], sort=False):
+        for design, J in own.groupby("design")["J"]:
+            mark = marks.get((plant, design, size), "")
+            cells[plant, size, design] = f"{J.median():.3g}/{J.max():.3g}{mark}"
+        last[plant, size] = accepts(own, size)
+    lines = [[x, *(cells.get((*key, x), "") for key in last)] for x in rows["design"].unique()]
+    lines.append(["kept, dearer, most", *last.values()])
+    return table(["", *(f"{plant}, {size:,}" for plant, size in last)], lines)
 
 
 def accepts(rows: Any, size: int) -> str:
