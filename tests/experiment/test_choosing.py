@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -374,3 +375,21 @@ def test_a_table_of_another_log_is_named():
     other = Choice(table((8, 1.0, 0.1, 40, True), names=["MPC"]))
     with pytest.raises(QPError, match=r"starts\.csv: got 'MPC', expected one of linear MPC"):
         choose(cfg, physics, collect_log(cfg, physics), choice=other)
+
+
+def test_one_episode_alone_chooses_no_start(monkeypatch):
+    """Of two policies with costs of one distribution the start is rarely chosen."""
+    rng = np.random.default_rng(0)
+
+    def evaluated(*_: Any, starts: int) -> Any:
+        return SimpleNamespace(costs=torch.as_tensor(rng.normal(10, 3, (1, starts))))
+
+    for name in ("zero_action", "make_mpc", "warm_policy"):
+        monkeypatch.setattr(choosing, name, lambda *_: None)
+    monkeypatch.setattr(choosing, "evaluate", evaluated)
+    bar = SimpleNamespace(set_postfix_str=lambda _: None, update=lambda: None)
+    start = {choosing.LINEAR: SimpleNamespace(plant=lambda physics: physics)}
+    task = SimpleNamespace(start_episodes=1, eval_steps=1, gamma=0.9)
+    cfg: Any = SimpleNamespace(task=task, seed=1)
+    names = [choosing._compared(cfg, None, start, bar).name for _ in range(100)]  # pyright: ignore
+    assert names.count(choosing.LINEAR) <= 15

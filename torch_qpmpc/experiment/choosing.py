@@ -153,8 +153,9 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         gain = torch.where(zero.isfinite(), costs[best] - zero, -torch.inf)
         test = PairedTest(2 * ALPHA)
         test.add(gain)
-        # The episodes of a plant without chance are equal.
-        better = test.decision == "better" or gain.max() - gain.min() <= 1e-9 * gain.abs().mean()
+        # The episodes of a plant without chance are equal; one alone does not show it.
+        equal = len(gain) > 1 and gain.max() - gain.min() <= 1e-9 * gain.abs().mean()
+        better = test.decision == "better" or bool(equal)
         if better or test.decision == "worse" or len(gain) >= MOST * few:
             break
         run(best)
