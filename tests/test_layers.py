@@ -33,7 +33,7 @@ BUDGET = {
     "analysis": 851,
     "control": 4871,  # nonlinear plants
     "envs": 1427,
-    "experiment": 2882,
+    "experiment": 2886,
     "export": 1500,
     "learning": 2833,  # models that did not train theta decide in improve
     "identification": 2638,

@@ -121,18 +121,6 @@ PCGYM: dict[str, dict[str, Any]] = {
         },
         "x0": np.array([*[350.0, 340.0, 310.0] * 8, 320.0]),
     },
-    "polymerisation_reactor": {
-        "N": 60,
-        "tsim": 2,
-        "SP": {"M": [3.0] * 60},
-        "r_scale": {"M": 10.0},
-        "o_space": {"low": np.array([300.0, 0, 0, 1.5]), "high": np.array([400.0, 10, 1, 3.5])},
-        "a_space": {
-            "low": np.array([0.1, 320.0, 4.0, 0.3]),
-            "high": np.array([2.0, 360.0, 8.0, 1.0]),
-        },
-        "x0": np.array([340.0, 5.0, 0.3, 3.0]),
-    },
     "nonsmooth_control": {
         "N": 60,
         "tsim": 5,
@@ -149,24 +137,23 @@ def pcgym_parameters(model: str) -> dict[str, Any]:
     common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
     own = PCGYM[model]
     common |= {"r_scale": dict.fromkeys(own["SP"], 1e3), "integration_method": "casadi"}
-    if model in ("heat_exchanger", "polymerisation_reactor"):
-        own = {**own, "custom_model": CustomModel(model)}
+    if model == "heat_exchanger":  # make_env cannot make it by its name
+        own = {**own, "custom_model": HeatExchanger()}
     return {**common, **own, "model": model}
 
 
-class CustomModel:
-    """A model of pcgym that its make_env cannot make by name."""
+class HeatExchanger:
+    """pcgym's heat exchanger, which unpacks what CasADi does not let it unpack."""
 
     int_method = "casadi"
 
-    def __init__(self, name: str) -> None:
-        self.model = getattr(import_module("pcgym.model_classes"), name)()
+    def __init__(self) -> None:
+        self.model = import_module("pcgym.model_classes").heat_exchanger()
         self.info = self.model.info
 
     def __call__(self, x: Any, u: Any) -> Any:
-        split = import_module("casadi").vertsplit  # CasADi's vectors are not unpacked
-        fmax = import_module("casadi").fmax  # an integration step may go below zero
-        return self.model([fmax(e, 0.0) for e in split(x)], split(u))
+        split = import_module("casadi").vertsplit
+        return self.model(split(x), split(u))
 
 
 class PcGym(gymnasium.Wrapper):
@@ -364,7 +351,6 @@ PLANTS = {
     "pcgym cstr": _pcgym("cstr"),
     "pcgym four_tank": _pcgym("four_tank"),
     "pcgym multistage_extraction": _pcgym("multistage_extraction"),
-    "pcgym polymerisation_reactor": _pcgym("polymerisation_reactor"),
     "Cart-pole from hanging": _own("SwingUp", plants.CartPole, plants.cross_entropy),
     "Two stocks in a row": _own("TwoStocks", plants.TwoStocks, plants.base_stocks),
     "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.evaluation import Evaluation, cost_text, gap_text
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
+from torch_qpmpc.experiment.rivals import scalar_name
 from torch_qpmpc.experiment.run_folder import RunFolder
 from torch_qpmpc.learning.updates import Scalars
 from torch_qpmpc.mpc.module import QPMPC
@@ -136,8 +136,7 @@ def report(run: RunFolder, mpc: QPMPC, evaluation: Evaluation, update: int) -> d
     summary = evaluation.summary()
     scalars = {f"eval/{name}": summary[name] for name in ("J_true_model", "closed_gap")}
     scalars |= {f"eval/{name}": summary[f"{name}_best"] for name in ("J", "J_discounted")}
-    tags = {name: re.sub(r"\W+", "_", name).strip("_") for name in evaluation.rivals}
-    scalars |= {f"eval/J_{tags[name]}": J for name, J in evaluation.rivals.items()}
+    scalars |= {f"eval/J_{scalar_name(name)}": J for name, J in evaluation.rivals.items()}
     if update:
         distances = distance_by_band(mpc) | structure_metrics(mpc)
         scalars |= {f"structure/{name}": distance for name, distance in distances.items()}

@@ -6,6 +6,7 @@ The rival `IDENTIFICATION` of each task is made at the end of a run; see
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,11 @@ Policy = Callable[[Tensor], Tensor]
 HORIZON, SLACK = 10, 100.0
 #: Steps after which the variance of a random walk is its mean over an episode of 50.
 HALF_EPISODE = 25
+
+
+def scalar_name(name: str) -> str:
+    """Return a rival's name as that of a scalar."""
+    return re.sub(r"\W+", "_", name).strip("_")
 
 
 def zero_action(plant: Any) -> Policy:

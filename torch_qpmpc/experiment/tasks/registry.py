@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
 from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings
-from torch_qpmpc.experiment.rivals import Policy
+from torch_qpmpc.experiment.rivals import Policy, scalar_name
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
 from torch_qpmpc.mpc.layout import Layout
@@ -119,8 +118,8 @@ def register(task: Task) -> None:
         QPError: a built-in task has the name, or two entries of the metrics would have one name.
     """
     check_kind("task", task, Task)
-    words = [re.sub(r"\W+", "_", name) for name in task.rivals]
-    if len({*words}) < len(words) or {*words} & TAKEN:
+    names = [*map(scalar_name, task.rivals)]
+    if len({*names}) < len(names) or {*names} & TAKEN:
         want = f"names that differ as words, from each other and {', '.join(sorted(TAKEN))}"
         raise QPError.expected("task.rivals", f"{[*task.rivals]}", want)
     known = TASKS.get(task.name)
