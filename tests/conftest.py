@@ -1,7 +1,5 @@
 """Compile the kernels once for all workers; give the fixtures to the processes that run tests."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

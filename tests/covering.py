@@ -1,7 +1,5 @@
 """Covering sets of parameter combinations: every pair of choices, but not every combination."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 from typing import Any

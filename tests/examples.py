@@ -1,7 +1,5 @@
 """The tasks in docs/examples, which register themselves."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """Schemes of every kind for the export as C, random QPs, and C compilers."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What a figure shows, and a learned QP of the point mass to draw."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The fixtures of all tests; xdist's own process, which runs none, does not import them."""
 
-from __future__ import annotations
-
 import copy
 import ctypes
 import functools

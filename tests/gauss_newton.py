@@ -1,7 +1,5 @@
 """A reference of the Gauss-Newton step: dense in theta, with autograd's gradients."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector

@@ -1,7 +1,5 @@
 """A double integrator with steps of 0.2, of which the tests of proofs ask questions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fill Numba's cache on disk with the kernels that the tests share: ``python -m tests.kernels``."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

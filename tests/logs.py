@@ -1,7 +1,5 @@
 """Logs of an ARX plant with two lags, and of a room as a table."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

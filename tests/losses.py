@@ -1,7 +1,5 @@
 """Small TorchRL losses with the QP in one or more roles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Random QPs with known solutions, built from KKT points, and random QPMPCs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

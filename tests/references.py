@@ -1,7 +1,5 @@
 """The paper's programs written for independent solvers: cvxpy and quadprog."""
 
-from __future__ import annotations
-
 import cvxpy as cp
 import numpy as np
 import quadprog

@@ -1,7 +1,5 @@
 """Transitions of vectorised environments, also of ones whose episodes start at different steps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

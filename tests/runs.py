@@ -1,7 +1,5 @@
 """Configurations for the tests, composed as by train.py and small enough to run in a second."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import os

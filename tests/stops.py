@@ -1,7 +1,5 @@
 """Stopping and resuming runs, and comparing them with undisturbed ones."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

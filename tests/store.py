@@ -1,7 +1,5 @@
 """A small plant with previews and noise: a store that is filled by price."""
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 

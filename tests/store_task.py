@@ -1,7 +1,5 @@
 """``task=store``: a `Store` as a task, registered as by a user's script."""
 
-from __future__ import annotations
-
 from tests.store import Store, scheme
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.tasks import Task, register

@@ -1,7 +1,5 @@
 """The scripts of the actor-critic page: short, and each learns for a few updates."""
 
-from __future__ import annotations
-
 import math
 import runpy
 from pathlib import Path

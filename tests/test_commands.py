@@ -6,8 +6,6 @@ them, page by page in a copy of the repository, and prints their times; those of
 quick in one process.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

@@ -1,7 +1,5 @@
 """The documentation holds: its Python runs, its commands are possible, its names exist."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import importlib.util

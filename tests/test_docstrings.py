@@ -1,7 +1,5 @@
 """The reference is complete: every public name, its methods and its arguments are documented."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import inspect

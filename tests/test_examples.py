@@ -1,7 +1,5 @@
 """Each example in docs/examples learns, by the command that its page names."""
 
-from __future__ import annotations
-
 import math
 import runpy
 

@@ -1,7 +1,5 @@
 """`import torch_qpmpc`: what it imports, and the names that it imports only when they are used."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The layers of the package and their allowed imports."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A tensor that requires grad is differentiated or refused by its name, at every public door."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnhashable=false
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The notebooks run with small settings, and their stored outputs are small."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """The sdist and the wheel are complete and minimal; package.yml runs README.md's examples."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

@@ -1,7 +1,5 @@
 """A folder from a stranger runs no code. Each payload only leaves a mark, which must not appear."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Transitions for the Q-learning loss, a small QP to learn, and reference targets."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

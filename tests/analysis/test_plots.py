@@ -1,7 +1,5 @@
 """Figures of a QP are drawn, with finite numbers and labels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gains against the regulator."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

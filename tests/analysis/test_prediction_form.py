@@ -1,7 +1,5 @@
 """The prediction form equals stepping the model in any gauge; the canonical matrix is C_0."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """A model with previews is read as it is, from the QP and in any gauge."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

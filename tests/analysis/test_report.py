@@ -1,7 +1,5 @@
 """The report of a known scheme has its numbers; an unreadable C is refused."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Structural defects against loops over blocks, and known schemes' models and orders."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -10,8 +10,6 @@ tank that of a step, in 32 loops of 96. Finished rows are kept in docs/results/c
 table goes into docs/results/improvement.md. ``--time`` measures a hundred gradients instead.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable, Iterable

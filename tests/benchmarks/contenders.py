@@ -4,8 +4,6 @@ A contender's `Gradient` computes one Q-learning gradient (eq:thup): V on the ne
 visited pairs, and the gradient of half the mean squared TD error in all of theta.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

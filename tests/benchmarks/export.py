@@ -6,8 +6,6 @@ Warm is a closed loop of 32 starts with 50 steps, cold random states without a w
 time is its median over several passes, in which the contenders take turns.
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import subprocess

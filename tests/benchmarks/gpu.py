@@ -7,8 +7,6 @@ C and N = 10; all of theta is learned. qpax (with JAX for the GPU) and Moreau ar
 installed.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

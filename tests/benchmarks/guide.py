@@ -9,8 +9,6 @@ umv's has a product of an output and an input. All are the mean of the 32 episod
 `tests.benchmarks.outside`.
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -6,8 +6,6 @@ that no setting was chosen on. Finished runs are kept in docs/results/improvemen
 repeated; the tables go into docs/results/improvement.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import tempfile

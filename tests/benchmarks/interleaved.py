@@ -1,7 +1,5 @@
 """Interleaved timing of two functions, so that other load does not affect their ratio."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from statistics import median

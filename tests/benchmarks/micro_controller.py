@@ -20,8 +20,6 @@ J is the mean cost of a step in 64 new loops of 400 steps. ``--write`` puts the 
 docs/results/improvement.md; seeds 1 and 2 chose the settings.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import subprocess

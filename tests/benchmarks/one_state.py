@@ -8,8 +8,6 @@ of the machine explains, and the largest. "Default threads" are torch's own numb
 is not installed is left out. Clarabel, which sets each QP up again, and CasADi get `FEW` steps.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """Other packages' differentiable QPs, each as a function from a QP and fixed entries to values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -11,8 +11,6 @@ are relative to the outputs' standard deviations there, and geometric means of t
 `SPLITS`, the shares of the log that are identified. At most the first `ROWS` rows are read.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 import warnings

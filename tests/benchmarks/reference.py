@@ -1,7 +1,5 @@
 """Reference values for all contenders, computed outside the package."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -19,8 +19,6 @@ those that train. Finished rows are kept in docs/results/rivals.csv; the table g
 docs/results/improvement.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

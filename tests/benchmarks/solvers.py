@@ -9,8 +9,6 @@ thread, the median of rounds in which the solvers take turns. A solver whose QP 
 `PATIENCE` gets one round, and no larger size. A package that is not installed is left out.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

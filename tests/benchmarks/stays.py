@@ -5,8 +5,6 @@ is the second V of one state for each solver, and a step of a controller; a read
 changes page as often.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Run the benchmarks and write their tables to the docs: ``python -m tests.benchmarks.table``."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

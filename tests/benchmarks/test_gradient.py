@@ -4,8 +4,6 @@ Each contender's rounds have rounds of ProxSuite's layer between them, up to bat
 in its last digits before each, so that nothing computed from it can be used twice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

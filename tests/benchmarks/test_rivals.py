@@ -1,7 +1,5 @@
 """The designs that `improve` is compared with, on plants that have a closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import torch

@@ -9,8 +9,6 @@ and, in the median, of a step. The other packages are optional, and a missing on
 The table goes into docs/results/conventions.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

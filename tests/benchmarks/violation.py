@@ -5,8 +5,6 @@ kind of noise, and holds a set-point beyond the upper bound for 300 steps of new
 puts the table into docs/results/conventions.md. Seeds 0 to 3 chose the step whose errors count.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ by itself. ``--write`` writes them to docs/reliability/measured.md. ``--solver``
 solves nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

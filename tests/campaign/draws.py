@@ -1,7 +1,5 @@
 """Random numbers of the campaign, and batches of QPs with their true outcomes."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass, replace
 from typing import Any

@@ -5,8 +5,6 @@ exact solution of the active set replaces it. ``--write`` puts the rows into the
 docs/reliability/measured.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Problems for the export: their QPs, random states, and the states of a closed loop."""
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from collections.abc import Callable

@@ -6,8 +6,6 @@ with one input and quadratic costs (``pip install pyscipopt``; without it these 
 come times for one input on and off, N = 24, in Python and C, beside raw DAQP and SCIP.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import time

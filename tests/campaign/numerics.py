@@ -5,8 +5,6 @@ Away from kinks every row of the known QPs is clearly active or clearly not; nea
 between the one-sided ones. All along a direction through q, b and the bounds.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import replace

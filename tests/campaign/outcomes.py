@@ -6,8 +6,6 @@ the cost of its z equal the known value, and if z is near the known z* in the no
 absolute terms of the Lagrangian at the known solution.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -3,8 +3,6 @@
 The entries d_k of the preview are a price of the actions, a disturbance, and bounds of the outputs.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

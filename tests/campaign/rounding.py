@@ -6,8 +6,6 @@ the status and the export's acceptance are the same, a value is right, and a fir
 `MOVE` of its range. The command prints the seed of each difference, and fails if there is one.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

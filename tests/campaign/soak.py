@@ -4,8 +4,6 @@ Each closes a loop of its own with the model, a load and noise. Dropouts and abs
 any signal, and operators take over in ten phases. Inputs must agree to `NEAR`, and codes exactly.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

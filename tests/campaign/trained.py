@@ -1,7 +1,5 @@
 """Matrices from training with an absurd learning rate."""
 
-from __future__ import annotations
-
 import functools
 
 import torch

@@ -5,8 +5,6 @@ Each design is made in units of order one, and again with y, u, x and d in units
 within 1e-6 of their ranges, for some designs in C, too.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

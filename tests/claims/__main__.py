@@ -6,8 +6,6 @@ its interval makes these pages stale: the command names them, and fails. ``FOLDE
 an empty folder, and so is the run's folder of ``python train.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

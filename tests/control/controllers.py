@@ -1,7 +1,5 @@
 """Controllers of the tests, of random plants too, and their functions in C."""
 
-from __future__ import annotations
-
 import functools
 import tempfile
 from collections.abc import Callable, Iterable

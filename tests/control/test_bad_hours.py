@@ -1,7 +1,5 @@
 """Dropouts, absurd signals, manual mode and new bounds: what Python does, and C beside it."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 from typing import Any

@@ -1,7 +1,5 @@
 """Mixed and terminal constraints of a `LinearMPC`, beside QPs of the tests' own and in C."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

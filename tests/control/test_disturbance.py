@@ -1,7 +1,5 @@
 """Disturbances that an observer can estimate, and messages about those that it cannot."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """`Controller.explain`: what limits a plan, and what it predicts, against QPs solved apart."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

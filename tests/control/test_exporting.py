@@ -3,8 +3,6 @@
 ``STEPS=100000 pytest tests/control/test_exporting.py`` compares loops of 100,000 steps.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`Controller.improve`: its gradient, its cost, what it gains, and what it refuses."""
 
-from __future__ import annotations
-
 import copy
 import functools
 

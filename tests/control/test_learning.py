@@ -1,7 +1,5 @@
 """`Controller.learn`: better models are accepted, others are not, and bad arguments are named."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

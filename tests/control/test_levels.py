@@ -1,7 +1,5 @@
 """Inputs on levels: minimum times over what was applied, limits, files and errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Bounds that are known signals, and so vary over the horizon."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

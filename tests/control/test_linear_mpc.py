@@ -1,7 +1,5 @@
 """`LinearMPC` beside the same problem in CVXPY, its set-points, and messages."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from types import SimpleNamespace

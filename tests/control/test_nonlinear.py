@@ -1,7 +1,5 @@
 """Controllers of nonlinear plants: a function, or what a log teaches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The filter of a model with a log starts from the states of the log, in Python and in C."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

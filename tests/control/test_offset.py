@@ -3,8 +3,6 @@
 ``PLANTS=200 pytest tests/control/test_offset.py`` draws more; `tests.campaign.units` has C, too.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from typing import Any

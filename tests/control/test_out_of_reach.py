@@ -4,8 +4,6 @@ The reference minimises the cost of `LinearMPC`'s docstring over a long horizon,
 Wright's turnpike its first input is that of an endless loop, whose slope the terminal cost has.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`Controller.redesign`: what is not named stays, for every argument, with two of each signal."""
 
-from __future__ import annotations
-
 import inspect
 from dataclasses import fields
 from typing import Any

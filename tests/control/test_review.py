@@ -1,7 +1,5 @@
 """`Controller.review`: designs with planted mistakes, which the remedies mend."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Saved MPCs and controllers: the same inputs to the last digit, and messages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`Controller.simulate`: loops with models and environments, their costs, figures and messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Models from matrices, systems and identifications, and messages."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

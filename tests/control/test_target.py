@@ -1,7 +1,5 @@
 """Targets with more inputs than outputs with a weight, beside independent solves."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The same plant in other units is the same controller: `python -m tests.campaign.units`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

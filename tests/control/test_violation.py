@@ -1,7 +1,5 @@
 """Bounds that outputs may leave in a share of the steps: quantiles of a log's errors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Closed loops against a plain reference implementation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

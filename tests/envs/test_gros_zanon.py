@@ -1,7 +1,5 @@
 """Gros and Zanon's system: dynamics, cost, violations, noise and starts, by hand."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Gymnasium environments as plants: requirements, and episodes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

@@ -1,7 +1,5 @@
 """The Kalman filter as a transform, in any TorchRL environment."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

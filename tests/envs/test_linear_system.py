@@ -1,7 +1,5 @@
 """Properties common to all plants, and the environments' agreement with their physics."""
 
-from __future__ import annotations
-
 import importlib
 import warnings
 from dataclasses import fields

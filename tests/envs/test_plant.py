@@ -1,7 +1,5 @@
 """Plants with previews and hidden states in TorchRL."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

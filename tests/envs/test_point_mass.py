@@ -1,7 +1,5 @@
 """The point mass: dynamics, cost, noise, starts, and random streams, which must not change."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gymnasium

@@ -1,7 +1,5 @@
 """What all vectorised environments keep in TorchRL: their specs, and their streams of numbers."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Tasks of the tests."""
 
-from __future__ import annotations
-
 import runpy
 from collections.abc import Iterator
 from pathlib import Path

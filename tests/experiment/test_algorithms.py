@@ -1,7 +1,5 @@
 """The parts of a run match the configuration and the paper's experiment."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

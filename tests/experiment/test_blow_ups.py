@@ -1,7 +1,5 @@
 """Episodes of logs that blow up."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

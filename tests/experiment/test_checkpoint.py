@@ -1,7 +1,5 @@
 """Checkpoints are written atomically; damage is found."""
 
-from __future__ import annotations
-
 import errno
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The choice of a start by closed loops, zero action if nothing is better, and its resumption."""
 
-from __future__ import annotations
-
 import copy
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Batches of transitions under the newest policy, from one process or several."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every key has a rule and is read, every rule has a key, and each bad value has a message."""
 
-from __future__ import annotations
-
 import math
 import re
 import sys

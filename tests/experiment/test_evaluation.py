@@ -1,7 +1,5 @@
 """The evaluation of a run: summary, rivals, and the same disturbances for all."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

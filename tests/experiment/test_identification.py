@@ -1,7 +1,5 @@
 """MPC with the model of a run's transitions and no learning, the rival of every task."""
 
-from __future__ import annotations
-
 import json
 import math
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Lock, Ctrl-C and errors of a launch, and the text of `python train.py --help`."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import signal

@@ -1,7 +1,5 @@
 """The numbers that a run logs, and its summary."""
 
-from __future__ import annotations
-
 import math
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """The figures of a run are drawn, finite and labelled."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MPC whose bounds are tightened by the covariance of the noise."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch.testing import assert_close

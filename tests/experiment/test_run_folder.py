@@ -1,7 +1,5 @@
 """A run's folder holds everything that was logged, also if the run is interrupted."""
 
-from __future__ import annotations
-
 import errno
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """A stopped and resumed run equals an undisturbed one, number for number."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """start=data: logs of exploration, the schemes identified from them, and runs that start there."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any

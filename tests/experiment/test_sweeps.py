@@ -1,7 +1,5 @@
 """Sweeps: launchers, finished and stopped runs, and sub-folders."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """A tally sums over the run, counts QPs per row, and is restored from a checkpoint."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 

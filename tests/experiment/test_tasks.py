@@ -1,7 +1,5 @@
 """The tasks' plants and QPs match the configuration and the papers."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import runpy

@@ -1,7 +1,5 @@
 """train.py, from the configuration to the run's folder."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """`CompiledPolicy`: the same actions and values from compiled C, and its errors."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """`export_c`: its files, its report, and its errors."""
 
-from __future__ import annotations
-
 import datetime
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """`export_fmu`: policies and controllers as FMUs, through their C interface and through FMPy."""
 
-from __future__ import annotations
-
 import ctypes
 import runpy
 import zipfile

@@ -1,7 +1,5 @@
 """The C of the guide compiles with its own Makefile line, and runs."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The exported C: solutions, codes, limits, and what compilers say."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 

@@ -1,7 +1,5 @@
 """The tables: multipliers move rows and actions as they say, and bad costs are refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -6,8 +6,6 @@ numbers of an undisturbed run. The processes are forks of this one, which has im
 so that they start within a second.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

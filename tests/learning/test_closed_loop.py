@@ -1,7 +1,5 @@
 """`improve`: the gradient of closed loops, what it gains, and what it refuses."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from typing import Any

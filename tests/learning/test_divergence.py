@@ -1,7 +1,5 @@
 """Far too large a learning rate spoils theta, but does not end the run."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """The QP in TorchRL's losses: as critic, actor, mean and state value, and in ensembles."""
 
-from __future__ import annotations
-
 import copy
 import io
 import itertools

@@ -1,7 +1,5 @@
 """The metric of Gauss-Newton's steps: no units, and sizes that fall slowly."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The QP as TorchRL modules: signs, shapes, shared parameters, and use in losses."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The penalties against the paper's formulas, written out entry by entry."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

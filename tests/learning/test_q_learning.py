@@ -1,7 +1,5 @@
 """The Q-learning loss: its values, its gradients, and the paper's update."""
 
-from __future__ import annotations
-
 import copy
 import math
 

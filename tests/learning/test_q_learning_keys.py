@@ -1,7 +1,5 @@
 """The Q-learning loss under renamed keys, and without a TensorDict."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

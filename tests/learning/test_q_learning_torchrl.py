@@ -1,7 +1,5 @@
 """TorchRL's contract of a loss module: estimators, target networks, copies, and resets."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

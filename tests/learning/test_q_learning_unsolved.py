@@ -1,7 +1,5 @@
 """The Q-learning loss where a QP has no certified solution."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Windows that never cross episodes, at any position of the ring, and reproducible sampling."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

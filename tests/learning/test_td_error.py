@@ -1,7 +1,5 @@
 """TD errors: the visited pairs that an update can learn from."""
 
-from __future__ import annotations
-
 import warnings
 
 import pytest

@@ -4,8 +4,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
 # pyright: reportOptionalOperand=false, reportOptionalMemberAccess=false
 
-from __future__ import annotations
-
 import copy
 import pickle
 from typing import Any

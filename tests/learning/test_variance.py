@@ -1,7 +1,5 @@
 """Weights of TD errors: their size, their limits, and what they are good for."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

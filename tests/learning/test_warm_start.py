@@ -1,7 +1,5 @@
 """Warm starts of replayed transitions from the active sets stored with them."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One table of QPMPCs: the paper's QP, linear MPC schemes, previews, and masks."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """The bounds of a scheme: their rows, and messages."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

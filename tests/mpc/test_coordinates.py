@@ -1,7 +1,5 @@
 """Residuals in theta's unconstrained coordinates: values, gradients, vmap, compile, messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The cost of a scheme: its weights, and messages."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What nobody chose: the terminal weight, and the stage cost."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

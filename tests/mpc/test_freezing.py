@@ -1,7 +1,5 @@
 """Entries of theta that ``learn={"C": mask}`` keeps fixed."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from typing import Any

@@ -1,7 +1,5 @@
 """The QP's cost of theta (eq:qpH), with its discounts; sizes; and blocks of equal actions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cvxpy

@@ -1,7 +1,5 @@
 """Actions on levels: V, Q and the policy equal enumeration, and gradients finite differences."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model of a scheme: its shapes, and the sizes that follow from it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """QPMPC: what holds for each row of one table of settings, and what it refuses."""
 
-from __future__ import annotations
-
 import copy
 import io
 import itertools

@@ -1,7 +1,5 @@
 """`QPMPC.predict` of one state: the answers of a batch, after every kind of change of theta."""
 
-from __future__ import annotations
-
 import copy
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """The step rules against the paper's program, and in updates of either order."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import sys

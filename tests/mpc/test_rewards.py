@@ -1,7 +1,5 @@
 """Costs of schemes from the rewards of logs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from tensordict import TensorDict

@@ -1,7 +1,5 @@
 """Save, load and predict: files that run no code, that later releases read, and arrays."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

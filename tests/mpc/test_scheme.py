@@ -1,7 +1,5 @@
 """A scheme describes a QPMPC: the short ways make one, and copies and identities follow from it."""
 
-from __future__ import annotations
-
 import copy
 import io
 import pickle

@@ -1,7 +1,5 @@
 """Arguments that `QPMPC` accepts: NumPy integers, lists, and tensors on any default device."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The encoding has one solution for each p: the policy."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

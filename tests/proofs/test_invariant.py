@@ -1,7 +1,5 @@
 """Invariant sets: against a plain computation, samples of the policy, and policies that leave."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Polytopes: bounding boxes, vertices, and their errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The growing mixed-integer program, on small programs with known optima."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import OptimizeResult

@@ -1,7 +1,5 @@
 """Worst cases: against closed forms, samples and the plant itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`torch.compile(fullgraph=True)` gives the eager numbers, or an error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """QPMPC under PyTorch's features: meta and fake tensors, dtypes, autocast, modes, copies."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 

@@ -1,7 +1,5 @@
 """Solving in threads and processes with every solver, after and during other solves."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`torch.func`: every feature of the QP under vmap, and its derivatives in both modes."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of runs that never ran."""
 
-from __future__ import annotations
-
 import pandas as pd
 
 

@@ -1,7 +1,5 @@
 """The figures have the numbers of the runs, and labels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
