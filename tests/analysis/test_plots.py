@@ -9,6 +9,7 @@ from torch.testing import assert_close
 
 from tests.figures import image_of, legend_of, make_mpc, rendered
 from tests.problems import drawn_mpc, normal
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.plots import (
     canonical_figure,
@@ -70,14 +71,10 @@ def test_plans_are_those_of_the_qp():
         assert_close(plan, mpc.predicted(mpc.solve(p[k]).z.detach()))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"y": Y[1:]}, r"y: got shape \(6, 2\), expected shape \(7, n_y\)"),
-        ({"u": Y}, r"u: got shape \(7, 2\), expected shape \(6, n_u\)"),
-    ],
+@refused(
+    ({"y": Y[1:]}, r"y: got shape \(6, 2\), expected shape \(7, n_y\)"),
+    ({"u": Y}, r"u: got shape \(7, 2\), expected shape \(6, n_u\)"),
 )
-def test_what_does_not_fit_is_named(options, message):
+def test_what_does_not_fit_is_named(options):
     arguments: dict[str, Any] = {"times": TIMES, "y": Y, "u": U}
-    with pytest.raises(QPError, match=message):
-        episode_figure(**(arguments | options))
+    episode_figure(**(arguments | options))

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from tests.problems import normal
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.analysis.structure import prediction_form
 from torch_qpmpc.mpc.layout import banded_matrix
@@ -71,17 +72,13 @@ def test_a_C_that_does_not_determine_the_states_is_refused():
         prediction_form(torch.stack((C, dependent)), n_x, n_u)
 
 
-@pytest.mark.parametrize(
-    ("C", "b", "message"),
-    [
-        (torch.zeros(15, 27), None, r"C: got shape \(15, 27\)"),
-        (torch.zeros(14, 28), None, r"C: got shape \(14, 28\)"),
-        (torch.zeros(0, 3), None, r"C: got shape \(0, 3\)"),
-        (torch.zeros(15, 28), torch.zeros(3), r"b: got shape \(3,\)"),
-        (torch.full((15, 28), torch.nan), None, "C, b: got NaN or inf"),
-        (torch.eye(15, 28), torch.full((15,), torch.inf), "C, b: got NaN or inf"),
-    ],
+@refused(
+    (torch.zeros(15, 27), None, r"C: got shape \(15, 27\)"),
+    (torch.zeros(14, 28), None, r"C: got shape \(14, 28\)"),
+    (torch.zeros(0, 3), None, r"C: got shape \(0, 3\)"),
+    (torch.zeros(15, 28), torch.zeros(3), r"b: got shape \(3,\)"),
+    (torch.full((15, 28), torch.nan), None, "C, b: got NaN or inf"),
+    (torch.eye(15, 28), torch.full((15,), torch.inf), "C, b: got NaN or inf"),
 )
-def test_bad_input(C, b, message):
-    with pytest.raises(QPError, match=message):
-        prediction_form(C, N_X, N_U, b)
+def test_bad_input(C, b):
+    prediction_form(C, N_X, N_U, b)

@@ -10,7 +10,8 @@ from torch.testing import assert_close
 
 from tests.figures import image_of, rendered
 from tests.problems import drawn_mpc, model_form, normal, predict
-from torch_qpmpc import QPMPC, DeviationPenalty, QPError
+from tests.refused import refused
+from torch_qpmpc import QPMPC, DeviationPenalty
 from torch_qpmpc.analysis.plots import canonical_figure
 from torch_qpmpc.analysis.policy import local_gain
 from torch_qpmpc.analysis.report import read
@@ -189,32 +190,19 @@ def test_figures_are_drawn_and_labelled():
     rendered(figure)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, N_D),
-            r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 14",
-        ),
-        (
-            lambda: read(scheme(), (A[:, :1], B)),
-            r"true_model's A: got shape \(2, 1\), expected shape \(2, 2\)",
-        ),
-        (lambda: read(scheme(), (A, B, OFFSET, E[:, :1])), r"true_model's E: got shape \(2, 1\)"),
-        (
-            lambda: read(scheme(), at=torch.zeros(2)),
-            r"at: got shape \(2,\), expected shape \(14,\)",
-        ),
-        (
-            lambda: one_step_error(nearest_model(model()), A, B, E=E[:, :1]),
-            r"E: got shape \(2, 1\), expected shape \(2, 2\)",
-        ),
-        (
-            lambda: canonical_matrix(model(), torch.zeros(N, N_X, 1)),
-            r"A: got shape \(5, 2, 1\), expected shape \(5, 2, 2\)",
-        ),
-    ],
+@refused(
+    (
+        lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, N_D),
+        r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 14",
+    ),
+    (lambda: read(scheme(), (A[:, :1], B)), r"true_model's A: got shape \(2, 1\), expected shape"),
+    (lambda: read(scheme(), (A, B, OFFSET, E[:, :1])), r"true_model's E: got shape \(2, 1\)"),
+    (lambda: read(scheme(), at=torch.zeros(2)), r"at: got shape \(2,\), expected shape \(14,\)"),
+    (
+        lambda: one_step_error(nearest_model(model()), A, B, E=E[:, :1]),
+        r"E: got shape \(2, 1\), expected shape \(2, 2\)",
+    ),
+    (lambda: canonical_matrix(model(), torch.zeros(N, N_X, 1)), r"A: got shape \(5, 2, 1\), expec"),
 )
-def test_bad_input(call, message):
-    with pytest.raises(QPError, match=message):
-        call()
+def test_bad_input(call):
+    call()

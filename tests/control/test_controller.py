@@ -11,6 +11,7 @@ import scipy.linalg
 import torch
 
 import torch_qpmpc as qm
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.qp.pipeline import solve
@@ -81,57 +82,35 @@ def test_a_reset_starts_where_the_plant_rests():
     assert np.allclose(controller.step([3.0], [3.0]), [0.0])
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda c: c.step([0.0]), "r: got None in the first step, expected set-points of y1"),
-        (lambda c: c.step([0.0, 1.0], [0.0]), r"y: got shape \(1, 2\), expected 1 numbers \(y1\)"),
-        (lambda c: c.reset([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
-        (
-            lambda c: c.reset([3.4e38]),
-            r"y: got 3\.4e\+38 of y1, expected at most 1e\+08 in size\. If it is no error, measure",
-        ),
-        (
-            lambda c: c.simulate(None, 3, [-1e12]),
-            r"r: got -1e\+12 of y1, expected at most 1e\+08 in size",
-        ),
-        (
-            lambda c: c.step(torch.zeros(1, requires_grad=True), [0.0]),
-            r"y: got a tensor that requires grad, expected one without. Pass y.deta",
-        ),
-        (
-            lambda c: c.step([0.0], torch.zeros(1, requires_grad=True)),
-            "r: got a tensor that requires grad, expected one without",
-        ),
-        (
-            lambda c: c.observe([0.0], {"valve": 1.0}),
-            r"u: got signals \['valve'\], expected the signals \['u1'\]",
-        ),
-        (lambda c: c.redesign(u_bounds=(1.0, -1.0)), "u_bounds: got lower 1 > upper -1 for u1"),
-        (
-            lambda _: qm.Controller(integrator(learn=("H", "q"))).redesign(Q=2.0),
-            "mpc: got an MPC that learns H, q, expected one whose theta is its design's. Change",
-        ),
-        (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
-        (
-            lambda c: c.step({"T": 0.0}, [0.0]),
-            r"y: got signals \['T'\], expected the signals \['y1'\]. None stands for a gap",
-        ),
-        (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
-        (
-            lambda c: qm.Controller(c.mpc, noise=0.0),
-            "noise: got 0 of y1, expected a standard deviation > 0 of each",
-        ),
-        (
-            lambda c: qm.Controller(c.mpc, drift=[1.0, 2.0]),
-            r"drift: got shape \(2,\) or NaN, expected a number, or one for",
-        ),
-        (lambda _: qm.Controller(Mock()), "mpc: got Mock, expected a LinearMPC"),
-    ],
+@refused(
+    (lambda c: c.step([0.0]), "r: got None in the first step, expected set-points of y1"),
+    (lambda c: c.step([0.0, 1.0], [0.0]), r"y: got shape \(1, 2\), expected 1 numbers \(y1\)"),
+    (lambda c: c.reset([np.nan], [0.0]), "y: got NaN or inf, expected finite numbers"),
+    (lambda c: c.reset([3.4e38]), r"y: got 3\.4e\+38 of y1, expected at most 1e\+08 in size\. If"),
+    (lambda c: c.simulate(None, 3, [-1e12]), r"r: got -1e\+12 of y1, expected at most 1e\+08 in s"),
+    (
+        lambda c: c.step(torch.zeros(1, requires_grad=True), [0.0]),
+        r"y: got a tensor that requires grad, expected one without. Pass y.deta",
+    ),
+    (
+        lambda c: c.step([0.0], torch.zeros(1, requires_grad=True)),
+        "r: got a tensor that requires grad, expected one without",
+    ),
+    (lambda c: c.observe([0.0], {"valve": 1.0}), r"u: got signals \['valve'\], expected the signa"),
+    (lambda c: c.redesign(u_bounds=(1.0, -1.0)), "u_bounds: got lower 1 > upper -1 for u1"),
+    (
+        lambda _: qm.Controller(integrator(learn=("H", "q"))).redesign(Q=2.0),
+        "mpc: got an MPC that learns H, q, expected one whose theta is its design's. Change",
+    ),
+    (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
+    (lambda c: c.step({"T": 0.0}, [0.0]), r"y: got signals \['T'\], expected the signals \['y1'\]"),
+    (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
+    (lambda c: qm.Controller(c.mpc, noise=0.0), "noise: got 0 of y1, expected a standard deviatio"),
+    (lambda c: qm.Controller(c.mpc, drift=[1.0, 2.0]), r"drift: got shape \(2,\) or NaN, expected"),
+    (lambda _: qm.Controller(Mock()), "mpc: got Mock, expected a LinearMPC"),
 )
-def test_bad_arguments_are_named(call, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        call(qm.Controller(integrator()))
+def test_bad_arguments_are_named(call):
+    call(qm.Controller(integrator()))
 
 
 def test_forecasts_that_are_missing_are_named():

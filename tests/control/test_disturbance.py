@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.disturbance import Steady, choose
 from torch_qpmpc.control.scaling import Scaling
@@ -40,22 +41,18 @@ def test_random_plants_with_integrators_get_detectable_disturbances_one_for_each
         assert full_rank(plant, w)
 
 
-@pytest.mark.parametrize(
-    ("model", "wanted", "message"),
-    [
-        (INTEGRATOR, {"y1": "output"}, "disturbances: .* cannot be told from a mode at 1"),
-        (INTEGRATOR, {"y2": "output"}, "disturbances: got 'y2': 'output', expected an output amo"),
-        (INTEGRATOR, "all", "disturbances: got 'all', expected 'auto', None or a mapping"),
-        (
-            ([[0.5, 0.0], [0.0, 1.0]], [[1.0], [1.0]], [[1.0, 0.0]]),
-            "auto",
-            "model: got a mode at 1, mostly in state 1, that no output shows",
-        ),
-    ],
+@refused(
+    (INTEGRATOR, {"y1": "output"}, "disturbances: .* cannot be told from a mode at 1"),
+    (INTEGRATOR, {"y2": "output"}, "disturbances: got 'y2': 'output', expected an output amo"),
+    (INTEGRATOR, "all", "disturbances: got 'all', expected 'auto', None or a mapping"),
+    (
+        ([[0.5, 0.0], [0.0, 1.0]], [[1.0], [1.0]], [[1.0, 0.0]]),
+        "auto",
+        "model: got a mode at 1, mostly in state 1, that no output shows",
+    ),
 )
-def test_disturbances_that_cannot_be_estimated_are_named(model, wanted, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        choose(read_model(model), wanted)
+def test_disturbances_that_cannot_be_estimated_are_named(model, wanted):
+    choose(read_model(model), wanted)
 
 
 def test_a_mode_at_one_without_an_input_has_no_steady_state():

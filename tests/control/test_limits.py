@@ -8,7 +8,7 @@ import torch
 
 import torch_qpmpc as qm
 from tests.control.controllers import exported
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.control.law import Outcome
 
 N = 8
@@ -165,16 +165,12 @@ def test_a_design_with_limits_is_reviewed_and_a_default_has_room():
     assert controller.review([9.0, 0.0]).faults
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"u_bounds": {"u1": (0.0, "ceiling")}}, r"u_bounds: got 'ceiling'.*\['low', 'cap', 'ceil"),
-        ({"y_bounds": ("low", "top")}, r"y_bounds: got 'top'.*numbers or known signals"),
-        ({"u_bounds": {"u1": (0.0, "cap", 1.0)}}, r"u_bounds: got .*expected pairs"),
-        ({"E": np.ones((2, 2))}, r"y_bounds: got 'low', which acts on the plant.*signal twice"),
-        ({"du_bounds": (0.0, "cap")}, r"du_bounds"),
-    ],
+@refused(
+    ({"u_bounds": {"u1": (0.0, "ceiling")}}, r"u_bounds: got 'ceiling'.*\['low', 'cap', 'ceil"),
+    ({"y_bounds": ("low", "top")}, r"y_bounds: got 'top'.*numbers or known signals"),
+    ({"u_bounds": {"u1": (0.0, "cap", 1.0)}}, r"u_bounds: got .*expected pairs"),
+    ({"E": np.ones((2, 2))}, r"y_bounds: got 'low', which acts on the plant.*signal twice"),
+    ({"du_bounds": (0.0, "cap")}, r"du_bounds"),
 )
-def test_a_wrong_limit_is_named(options, message):
-    with pytest.raises(QPError, match=message):
-        plant(**options)
+def test_a_wrong_limit_is_named(options):
+    plant(**options)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.lowering import riccati
 
@@ -191,50 +192,39 @@ def test_a_side_of_bounds_may_be_none():
         assert [side.tolist() for side in design.u_bounds] == sides
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"Q": None}, "Q: got no cost, expected weights .* Pass one, such as Q={'y1': 1.0}, dR="),
-        ({"Q": {"T": 1.0}}, "Q: got 'T', expected names among y1"),
-        ({"Q": [1.0, 2.0]}, r"Q: got shape \(2,\) or NaN, expected a number, or one for each of"),
-        ({"linear": {"u1": "d1"}, "E": [[1.0]]}, "linear: got 'd1', which acts on the plant"),
-        ({"Q": [[1.0, 2.0]]}, r"Q: got shape \(1, 2\), expected \(1, 1\)"),
-        ({"dR": -1.0}, "dR: got smallest eigenvalue -1, expected a positive semidefinite weight"),
-        ({"horizon": 0}, "horizon: got 0, expected a whole number >= 1"),
-        ({"blocks": [1, 1]}, r"blocks: got \[1, 1\], expected whole numbers .* the horizon 3"),
-        ({"blocks": 3}, "blocks: got 3, expected whole numbers"),
-        ({"references": "later"}, "references: got 'later', expected one of held, preview"),
-        ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
-        ({"y_slack": -1.0}, "y_slack: got {'y1': -1.0}, expected prices >= 0"),
-        ({"linear": 1.0}, "linear: got 1.0, expected a mapping from inputs"),
-        ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, .* Pass known=.'price'"),
-        ({"u_bounds": {"q": (0, 1)}}, "u_bounds: got 'q', expected names among u1"),
-        ({"u_bounds": {"u1": 1.0}}, "u_bounds: got {'u1': 1.0}, expected pairs .* by name"),
-        ({"u_bounds": 1.0}, "u_bounds: got 1.0, expected the pair"),
-        (
-            {"du_bounds": (0.1, 0.3)},
-            r"du_bounds: got \(0.1, 0.3\) for u1, expected bounds with zero",
-        ),
-        ({"u_bounds": (1.0, 0.0)}, "u_bounds: got lower 1 > upper 0 for u1, expected lower <="),
-    ],
+@refused(
+    ({"Q": None}, "Q: got no cost, expected weights .* Pass one, such as Q={'y1': 1.0}, dR="),
+    ({"Q": {"T": 1.0}}, "Q: got 'T', expected names among y1"),
+    ({"Q": [1.0, 2.0]}, r"Q: got shape \(2,\) or NaN, expected a number, or one for each of"),
+    ({"linear": {"u1": "d1"}, "E": [[1.0]]}, "linear: got 'd1', which acts on the plant"),
+    ({"Q": [[1.0, 2.0]]}, r"Q: got shape \(1, 2\), expected \(1, 1\)"),
+    ({"dR": -1.0}, "dR: got smallest eigenvalue -1, expected a positive semidefinite weight"),
+    ({"horizon": 0}, "horizon: got 0, expected a whole number >= 1"),
+    ({"blocks": [1, 1]}, r"blocks: got \[1, 1\], expected whole numbers .* the horizon 3"),
+    ({"blocks": 3}, "blocks: got 3, expected whole numbers"),
+    ({"references": "later"}, "references: got 'later', expected one of held, preview"),
+    ({"gamma": 0}, "gamma: got 0, expected a discount factor"),
+    ({"y_slack": -1.0}, "y_slack: got {'y1': -1.0}, expected prices >= 0"),
+    ({"linear": 1.0}, "linear: got 1.0, expected a mapping from inputs"),
+    ({"linear": {"u1": "price"}}, "linear: got {'u1': 'price'}, .* Pass known=.'price'"),
+    ({"u_bounds": {"q": (0, 1)}}, "u_bounds: got 'q', expected names among u1"),
+    ({"u_bounds": {"u1": 1.0}}, "u_bounds: got {'u1': 1.0}, expected pairs .* by name"),
+    ({"u_bounds": 1.0}, "u_bounds: got 1.0, expected the pair"),
+    ({"du_bounds": (0.1, 0.3)}, r"du_bounds: got \(0.1, 0.3\) for u1, expected bounds with zero"),
+    ({"u_bounds": (1.0, 0.0)}, "u_bounds: got lower 1 > upper 0 for u1, expected lower <="),
 )
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        qm.LinearMPC(SCALAR, **{"horizon": 3, "Q": 1.0, **arguments})
+def test_bad_arguments_are_named(arguments):
+    qm.LinearMPC(SCALAR, **{"horizon": 3, "Q": 1.0, **arguments})
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"z": 1.0}, "signals: got 'z', expected some of u_last, known"),
-        ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected 1 entries"),
-        ({"known": np.ones((3, 2))}, "known: .* expected 0 entries"),
-    ],
+@refused(
+    ({"z": 1.0}, "signals: got 'z', expected some of u_last, known"),
+    ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected 1 entries"),
+    ({"known": np.ones((3, 2))}, "known: .* expected 0 entries"),
 )
-def test_signals_that_are_not_those_of_p_are_named(arguments, message):
+def test_signals_that_are_not_those_of_p_are_named(arguments):
     mpc = qm.LinearMPC(SCALAR, 3, Q=1.0)
-    with pytest.raises(QPError, match=f"^{message}"):
-        mpc.arrange(**{"x": [1.0], "target": mpc.target([0.0]), **arguments})
+    mpc.arrange(**{"x": [1.0], "target": mpc.target([0.0]), **arguments})
 
 
 def test_set_points_of_another_size_are_named():

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import torch_qpmpc as qm
 import torch_qpmpc.control.law
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.identification import learned
@@ -200,20 +201,12 @@ def test_what_needs_matrices_refuses_functions(tmp_path, log):
         own.save(tmp_path / "own.qpmpc")
 
 
-@pytest.mark.parametrize(
-    ("model", "options", "message"),
-    [
-        ((lambda x, u: x.sqrt() + u, [0.0], [0.0]), {}, "x\\+ or its slope with NaN or inf at"),
-        ((lambda x, u: x[0], [0.0], [0.0]), {}, "dynamics: got x\\+ and l of shapes"),
-        ((lambda x, u: (u, x[..., 0]), [0.0], [0.0]), {}, "model: got a stage cost"),
-        ((lambda x, u: x, [0.0], [0.0]), {"E": [[1.0]]}, "E: got .*, expected None"),
-        (
-            LearnedModel([0.0] * 2, [1.0] * 2, np.ones((3, 1)), 1),
-            {},
-            "model: got a file's",
-        ),
-    ],
+@refused(
+    ((lambda x, u: x.sqrt() + u, [0.0], [0.0]), {}, ".*x\\+ or its slope with NaN or inf at"),
+    ((lambda x, u: x[0], [0.0], [0.0]), {}, "dynamics: got x\\+ and l of shapes"),
+    ((lambda x, u: (u, x[..., 0]), [0.0], [0.0]), {}, "model: got a stage cost"),
+    ((lambda x, u: x, [0.0], [0.0]), {"E": [[1.0]]}, "E: got .*, expected None"),
+    (LearnedModel([0.0] * 2, [1.0] * 2, np.ones((3, 1)), 1), {}, "model: got a file's"),
 )
-def test_invalid_models_are_errors(model, options, message):
-    with pytest.raises(QPError, match=message):
-        qm.Controller(qm.LinearMPC(model, 5, Q=1.0, **options))
+def test_invalid_models_are_errors(model, options):
+    qm.Controller(qm.LinearMPC(model, 5, Q=1.0, **options))

@@ -10,6 +10,7 @@ import scipy.signal
 from matplotlib.figure import Figure
 
 import torch_qpmpc as qm
+from tests.refused import refused
 from torch_qpmpc import QPError
 
 pytestmark = pytest.mark.layout
@@ -155,28 +156,21 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
     assert figure.axes[0].get_xlim() == (0.0, 300.0)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
-        ({"r": None}, "r: got None in the first step, expected set-points of y1"),
-        ({"noise": -1.0}, r"noise: got \[-1.0\], expected standard deviations >= 0"),
-        ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
-        ({"u": [1.0, 2.0]}, r"u: got shape \(1, 2\), expected 1 numbers"),
-        ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
-        (
-            {"plant": ([[0.5]], [[1.0, 1.0]])},
-            "plant: got 2 inputs, 1 outputs, 0 known signals, expected the controller's 1 input",
-        ),
-        (
-            {"plant": qm.LinearMPC(LAG, 3, Q=1.0, E=[[1.0]]).design.plant},
-            "plant: got 1 inputs, 1 outputs, 1 known signals, expected the controller's 1 input",
-        ),
-    ],
+@refused(
+    ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
+    ({"r": None}, "r: got None in the first step, expected set-points of y1"),
+    ({"noise": -1.0}, r"noise: got \[-1.0\], expected standard deviations >= 0"),
+    ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
+    ({"u": [1.0, 2.0]}, r"u: got shape \(1, 2\), expected 1 numbers"),
+    ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
+    ({"plant": ([[0.5]], [[1.0, 1.0]])}, "plant: got 2 inputs, 1 outputs, 0 known signals, expect"),
+    (
+        {"plant": qm.LinearMPC(LAG, 3, Q=1.0, E=[[1.0]]).design.plant},
+        "plant: got 1 inputs, 1 outputs, 1 known signals, expected the controller's 1 input",
+    ),
 )
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        made().simulate(**{"r": [1.0], **arguments})
+def test_bad_arguments_are_named(arguments):
+    made().simulate(**{"r": [1.0], **arguments})
 
 
 def test_a_plant_of_other_steps_or_signals_in_another_order_is_named():

@@ -9,6 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import train
+from tests.refused import refused
 from tests.runs import CONFIGS, SMALL, choices, compose_config, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment import config
@@ -136,26 +137,22 @@ def test_missing_keys(key):
         Config.of(cfg)  # a misspelt key is named before the missing one
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ("constraint.learn=[b]", r"constraint.learn: got \['b'\], expected a list with C, .* or "),
-        ("constraint=si task.episode_steps=5", "task.episode_steps: got 5, expected at least task"),
-        ("constraint=fixed task.learn_cost=[]", r"task.learn_cost: got \[\], expected something"),
-        ("constraint=si replay=false", "replay: got False, expected true. constraint.si"),
-        ("constraint.structure=tied", "constraint.structure: got 'tied', expected free. A tied C"),
-        ("constraint=si constraint.structure=tied", "got 'tied', expected free. gauss_new"),
-        ("constraint=mpc constraint.learn=[C,G]", r"got \['C', 'G'\], expected no G. No task has"),
-        ("task.terminal_weight=riccati", "got 'riccati', expected default or identity. The Ricc"),
-        ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
-        ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),
-        ("rivals=[nobody]", r"rivals: got \['nobody'\], expected .* identification. They are the"),
-        ("num_envs=7", r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
-    ],
+@refused(
+    ("constraint.learn=[b]", r"constraint.learn: got \['b'\], expected a list with C, .* or "),
+    ("constraint=si task.episode_steps=5", "task.episode_steps: got 5, expected at least task"),
+    ("constraint=fixed task.learn_cost=[]", r"task.learn_cost: got \[\], expected something"),
+    ("constraint=si replay=false", "replay: got False, expected true. constraint.si"),
+    ("constraint.structure=tied", "constraint.structure: got 'tied', expected free. A tied C"),
+    ("constraint=si constraint.structure=tied", ".*got 'tied', expected free. gauss_new"),
+    ("constraint=mpc constraint.learn=[C,G]", r".*got \['C', 'G'\], expected no G. No task has"),
+    ("task.terminal_weight=riccati", ".*got 'riccati', expected default or identity. The Ricc"),
+    ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
+    ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),
+    ("rivals=[nobody]", r"rivals: got \['nobody'\], expected .* identification. They are the"),
+    ("num_envs=7", r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
 )
-def test_values_that_do_not_fit_each_other(overrides, message):
-    with pytest.raises(QPError, match=message):
-        make_config(*overrides.split())
+def test_values_that_do_not_fit_each_other(overrides):
+    make_config(*overrides.split())
 
 
 def test_the_step_rule_needs_its_solver(monkeypatch):

@@ -13,6 +13,7 @@ import torch
 from pydantic import Field
 
 import train
+from tests.refused import refused
 from tests.runs import (
     SMALL,
     compose_config,
@@ -143,24 +144,17 @@ def test_the_true_scheme_has_the_mean_of_the_noise():
 # Gymnasium
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (("task.A=null",), r"^task\.A: got null, expected the rows of a matrix \(3, 3\)"),
-        (
-            ("task.id=MountainCarContinuous-v0",),
-            r"A, B: got shapes \(3, 3\) and \(3, 1\), expected \(2, 2\) and \(2, 1\)",
-        ),
-        (
-            ("start=data", "task.stage_weight=[[1]]", "task.A=null", "task.B=null"),
-            r"stage_weight: got shape \(1, 1\), expected shape \(4, 4\)",
-        ),
-    ],
+@refused(
+    (("task.A=null",), r"^task\.A: got null, expected the rows of a matrix \(3, 3\)"),
+    (("task.id=MountainCarContinuous-v0",), r"A, B: got shapes \(3, 3\) and \(3, 1\), expected"),
+    (
+        ("start=data", "task.stage_weight=[[1]]", "task.A=null", "task.B=null"),
+        r".*stage_weight: got shape \(1, 1\), expected shape \(4, 4\)",
+    ),
 )
-def test_a_model_or_a_weight_of_other_dimensions_is_named(overrides, message):
+def test_a_model_or_a_weight_of_other_dimensions_is_named(overrides):
     cfg = make_config("task=pendulum", *overrides)
-    with pytest.raises(QPError, match=message):
-        make_mpc(cfg, make_physics(cfg))
+    make_mpc(cfg, make_physics(cfg))
 
 
 def test_a_model_on_the_command_line_is_that_of_the_qp():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests.exported import rates, tied
+from tests.refused import refused
 from torch_qpmpc import CompiledPolicy, QPError, SolverError
 from torch_qpmpc.export import library
 
@@ -134,23 +135,13 @@ def test_the_compiler_may_have_arguments_and_be_one_of_cpp(command, monkeypatch)
     torch.testing.assert_close(CompiledPolicy(tied())(s), tied().policy(s).detach())
 
 
-@pytest.mark.parametrize(
-    ("command", "match"),
-    [
-        (
-            "no-such-compiler -O2",
-            "compiler: got none on the PATH.* 'no-such-compiler' does not exist",
-        ),
-        (
-            "gcc '",
-            r"\$CC: got \"gcc '\": No closing quotation, expected a command. Correct or unset",
-        ),
-    ],
+@refused(
+    ("no-such-compiler -O2", "compiler: got none on the PATH.* 'no-such-compiler' does not exist"),
+    ("gcc '", r"\$CC: got \"gcc '\": No closing quotation, expected a command. Correct or unset"),
 )
-def test_a_wrong_command_is_named(command, match, monkeypatch):
+def test_a_wrong_command_is_named(command, monkeypatch):
     monkeypatch.setenv("CC", command)
-    with pytest.raises(QPError, match=match):
-        CompiledPolicy(tied())
+    CompiledPolicy(tied())
 
 
 def test_a_compiler_that_does_not_run_is_named(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 import torch_qpmpc as qm
 from tests.logs import arx_log, room
+from tests.refused import refused
 from torch_qpmpc import QPMPC, QPError
 
 N = 6
@@ -154,36 +155,26 @@ def discrete_actions(log: TensorDict) -> TensorDict:
     return log
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda: qm.identify(lag_log(steps=4), N),
-            "trajectories: got 4 transitions in 1 trajectories, expected at least 5 for .* Log mo",
-        ),
-        (
-            lambda: qm.identify(frozen_action(arx_log()), N),
-            "action: got u1 constant at 0.3, expected one that moves. Add a random signal",
-        ),
-        (
-            lambda: qm.identify(feedback(arx_log()), N),
-            "action: got u1 a linear function of the outputs and other actions, as in feed",
-        ),
-        (
-            lambda: qm.identify(discrete_actions(arx_log()), N),
-            "action: got one-hot vectors of discrete ones, expected continuous actions",
-        ),
-        (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
-        (lambda: qm.identify(arx_log(), order=-1), "order: got -1, expected a whole number >= 0"),
-        (
-            lambda: qm.identify(arx_log(), N, n_x=3),
-            r"observation: got shape \(3, 40, 2\), expected",
-        ),
-    ],
+@refused(
+    (
+        lambda: qm.identify(lag_log(steps=4), N),
+        "trajectories: got 4 transitions in 1 trajectories, expected at least 5 for .* Log mo",
+    ),
+    (
+        lambda: qm.identify(frozen_action(arx_log()), N),
+        "action: got u1 constant at 0.3, expected one that moves. Add a random signal",
+    ),
+    (lambda: qm.identify(feedback(arx_log()), N), "action: got u1 a linear function of the output"),
+    (
+        lambda: qm.identify(discrete_actions(arx_log()), N),
+        "action: got one-hot vectors of discrete ones, expected continuous actions",
+    ),
+    (lambda: qm.identify(arx_log(), 0), "horizon: got 0, expected a whole number >= 1"),
+    (lambda: qm.identify(arx_log(), order=-1), "order: got -1, expected a whole number >= 0"),
+    (lambda: qm.identify(arx_log(), N, n_x=3), r"observation: got shape \(3, 40, 2\), expected"),
 )
-def test_a_mistake_is_named(call, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        call()
+def test_a_mistake_is_named(call):
+    call()
 
 
 def test_matrices_are_of_numpy_and_can_be_read():

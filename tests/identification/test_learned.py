@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
-from torch_qpmpc import QPMPC, QPError
+from tests.refused import refused
+from torch_qpmpc import QPMPC
 from torch_qpmpc.identification import learned
 from torch_qpmpc.identification.learned import LearnedModel, fit_learned, identify_nonlinear
 
@@ -125,13 +126,9 @@ def test_a_qpmpc_plans_with_the_model_and_is_saved_with_it(model, tmp_path):
     assert_close(LearnedModel(**model.arguments)(s, s[:, :1]), model(s, s[:, :1]))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((pendulum_log(episodes=1, steps=6),), "trajectories: got 6 steps"),
-        ((pendulum_log(episodes=1, steps=50), np.ones(3)), "cost: got 3 numbers, expected 50"),
-    ],
+@refused(
+    ((pendulum_log(episodes=1, steps=6),), "trajectories: got 6 steps"),
+    ((pendulum_log(episodes=1, steps=50), np.ones(3)), "cost: got 3 numbers, expected 50"),
 )
-def test_invalid_arguments_are_errors(arguments, message):
-    with pytest.raises(QPError, match=message):
-        qm.identify_nonlinear(*arguments)
+def test_invalid_arguments_are_errors(arguments):
+    qm.identify_nonlinear(*arguments)

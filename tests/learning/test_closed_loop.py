@@ -10,6 +10,7 @@ import torch
 
 import torch_qpmpc as qm
 from tests.problems import central_difference
+from tests.refused import refused
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified, identify
@@ -271,28 +272,24 @@ class ManyModels(PointMass):
     members = 9
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"mpc": None}, "mpc: got NoneType, expected a QPMPC"),
-        ({"plant": object()}, "plant: got object, without starts, draw, noise, step, cost"),
-        ({"updates": 0}, "updates: got 0"),
-        ({"loops": 0}, "loops: got 0"),
-        ({"steps": 0}, "steps: got 0"),
-        ({"window": 0}, "window: got 0"),
-        ({"members": 0}, "members: got 0"),
-        ({"held_out": 8}, "held_out: got 8"),
-        ({"plant": ManyModels(), "held_out": 16}, "held_out: got 16, .* whole number >= 18"),
-        ({"rate": 0.0}, "rate: got 0.0"),
-        ({"seed": -1}, "seed: got -1"),
-    ],
+@refused(
+    ({"mpc": None}, "mpc: got NoneType, expected a QPMPC"),
+    ({"plant": object()}, "plant: got object, without starts, draw, noise, step, cost"),
+    ({"updates": 0}, "updates: got 0"),
+    ({"loops": 0}, "loops: got 0"),
+    ({"steps": 0}, "steps: got 0"),
+    ({"window": 0}, "window: got 0"),
+    ({"members": 0}, "members: got 0"),
+    ({"held_out": 8}, "held_out: got 8"),
+    ({"plant": ManyModels(), "held_out": 16}, "held_out: got 16, .* whole number >= 18"),
+    ({"rate": 0.0}, "rate: got 0.0"),
+    ({"seed": -1}, "seed: got -1"),
 )
-def test_improve_refuses(change, message):
+def test_improve_refuses(change):
     plant = PointMass()
     weight = torch.tensor([1.0] * 4 + [0.1] * 2)
     mpc = qm.QPMPC.from_model(plant.A, plant.B, 3, stage_weight=weight)
-    with pytest.raises(QPError, match=message):
-        qm.improve(**{"mpc": mpc, "plant": plant, **change})  # pyright: ignore[reportArgumentType]
+    qm.improve(**{"mpc": mpc, "plant": plant, **change})  # pyright: ignore[reportArgumentType]
 
 
 def test_improve_refuses_an_mpc_that_learns_nothing():

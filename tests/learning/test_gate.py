@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.learning.gate import Gate, PairedTest
 
 
@@ -217,21 +217,17 @@ def test_the_state_is_restored():
     assert other.judge(Policy(3.0)) == gate.judge(Policy(3.0))
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: PairedTest(0.0), "alpha"),
-        (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a finite number > 0"),
-        (lambda: Gate(Policy(1.0), costs, bound=0.0), "bound"),
-        (lambda: Gate(Policy(1.0), costs, decisions=0), "decisions"),
-        (lambda: PairedTest().add(torch.zeros(2, 2)), "differences"),
-        (lambda: Gate(Policy(1.0), costs, pairs=8), "pairs"),
-        (lambda: Gate(Policy(1.0), costs, alpha=1.0), "alpha"),
-        (lambda: Gate(Policy(1.0), costs, patience=0), "patience"),
-        (lambda: Gate(Policy(1.0), costs, seed=-1), "seed"),
-        (lambda: Gate(Policy(1.0), lambda *_: torch.zeros(())).judge(Policy(1.0)), "costs"),
-    ],
+@refused(
+    (lambda: PairedTest(0.0), "alpha"),
+    (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a finite number > 0"),
+    (lambda: Gate(Policy(1.0), costs, bound=0.0), "bound"),
+    (lambda: Gate(Policy(1.0), costs, decisions=0), "decisions"),
+    (lambda: PairedTest().add(torch.zeros(2, 2)), "differences"),
+    (lambda: Gate(Policy(1.0), costs, pairs=8), "pairs"),
+    (lambda: Gate(Policy(1.0), costs, alpha=1.0), "alpha"),
+    (lambda: Gate(Policy(1.0), costs, patience=0), "patience"),
+    (lambda: Gate(Policy(1.0), costs, seed=-1), "seed"),
+    (lambda: Gate(Policy(1.0), lambda *_: torch.zeros(())).judge(Policy(1.0)), "costs"),
 )
-def test_errors(call, message):
-    with pytest.raises(QPError, match=message):
-        call()
+def test_errors(call):
+    call()

@@ -10,7 +10,8 @@ from torch.func import vmap
 from torch.testing import assert_close
 
 from tests.problems import MIXED, normal, random_mpc, random_states
-from torch_qpmpc import QPMPC, QPError, Status
+from tests.refused import refused
+from torch_qpmpc import QPMPC, Status
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 
 #: The mixed constraints for a preview of one entry.
@@ -177,21 +178,14 @@ def test_compiled_in_one_graph_equals_eager():
     assert_close(outcome(compiled), outcome(run))
 
 
-@pytest.mark.parametrize(
-    ("residuals", "message"),
-    [
-        ([0.0], "residuals: got list, expected a Mapping"),
-        ({"p": torch.zeros(3)}, "residuals: got 'p', expected names among H, H_f, q, c, C, b"),
-        ({"w": torch.zeros(3)}, r"residuals: got 'w', .* Add w to learn\."),
-        ({"b": torch.zeros(4, 5)}, r"residuals\['b'\]: got shape \(4, 5\), .*\(\*batch, 6\)"),
-        ({"b": torch.zeros(4, 6), "q": torch.zeros(3, 11)}, "batch: got shapes .* that broadcast"),
-        (
-            {"H": torch.zeros(4, 3), "H_f": torch.zeros(5, 2)},
-            "residuals: got batch dim.* that broadcast",
-        ),
-    ],
+@refused(
+    ([0.0], "residuals: got list, expected a Mapping"),
+    ({"p": torch.zeros(3)}, "residuals: got 'p', expected names among H, H_f, q, c, C, b"),
+    ({"w": torch.zeros(3)}, r"residuals: got 'w', .* Add w to learn\."),
+    ({"b": torch.zeros(4, 5)}, r"residuals\['b'\]: got shape \(4, 5\), .*\(\*batch, 6\)"),
+    ({"b": torch.zeros(4, 6), "q": torch.zeros(3, 11)}, "batch: got shapes .* that broadcast"),
+    ({"H": torch.zeros(4, 3), "H_f": torch.zeros(5, 2)}, "residuals: got batch dim.* that broadca"),
 )
-def test_residuals_that_do_not_fit(residuals, message):
+def test_residuals_that_do_not_fit(residuals):
     mpc = random_mpc(3, learn=("H", "H_f", "c", "C"))
-    with pytest.raises(QPError, match=message):
-        mpc.quadratic_program(residuals)
+    mpc.quadratic_program(residuals)

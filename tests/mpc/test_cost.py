@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from tests.refused import refused
 from torch_qpmpc import QPMPC, Cost, Layout, Model, QPError, Scheme
 
 LAYOUT, MODEL = Layout(2, 1, 3), Model(torch.eye(2), torch.ones(2, 1))
@@ -18,42 +19,31 @@ def test_q_and_c_are_without_discounts():
     assert mpc.c == 3
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"stage_weight": [1.0, torch.inf, 0.0]}, "stage_weight: got NaN or inf"),
-    ],
+@refused(
+    ({"stage_weight": [1.0, torch.inf, 0.0]}, "stage_weight: got NaN or inf"),
 )
-def test_bad_arguments_are_named(arguments, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        Cost(**arguments)
+def test_bad_arguments_are_named(arguments):
+    Cost(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"stage_weight": [1.0, 1.0]}, r"stage_weight: got shape \(2,\), expected shape \(3,\)"),
-        (
-            {"stage_weight": torch.ones(4, 3)},
-            r"stage_weight: got shape \(4, 3\), expected shape \(3,\) or \(3, 3\)",
-        ),
-        ({"stage_weight": [1.0, -2.0, 0.0]}, "stage_weight: got smallest eigenvalue -2"),
-        ({"terminal_weight": [1.0]}, r"terminal_weight: got shape \(1,\), expected shape \(2,\)"),
-        (
-            {"terminal_weight": [[1.0, 2.0], [2.0, 1.0]], "hessian": "block"},
-            "terminal_weight: got smallest eigenvalue -1, expected a positive semidefinite weight",
-        ),
-        (
-            {"terminal_weight": [[1.0, 0.5], [0.0, 1.0]], "hessian": "block"},
-            r"terminal_weight: got asymmetry 0.5, .* Pass \(W \+ W.mT\) / 2",
-        ),
-        ({"q": [1.0]}, r"q: got shape \(1,\), expected shape \(11,\)"),
-    ],
+@refused(
+    ({"stage_weight": [1.0, 1.0]}, r"stage_weight: got shape \(2,\), expected shape \(3,\)"),
+    ({"stage_weight": torch.ones(4, 3)}, r"stage_weight: got shape \(4, 3\), expected shape \(3,"),
+    ({"stage_weight": [1.0, -2.0, 0.0]}, "stage_weight: got smallest eigenvalue -2"),
+    ({"terminal_weight": [1.0]}, r"terminal_weight: got shape \(1,\), expected shape \(2,\)"),
+    (
+        {"terminal_weight": [[1.0, 2.0], [2.0, 1.0]], "hessian": "block"},
+        "terminal_weight: got smallest eigenvalue -1, expected a positive semidefinite weight",
+    ),
+    (
+        {"terminal_weight": [[1.0, 0.5], [0.0, 1.0]], "hessian": "block"},
+        r"terminal_weight: got asymmetry 0.5, .* Pass \(W \+ W.mT\) / 2",
+    ),
+    ({"q": [1.0]}, r"q: got shape \(1,\), expected shape \(11,\)"),
 )
-def test_a_scheme_refuses_a_cost_that_does_not_fit(arguments, message):
+def test_a_scheme_refuses_a_cost_that_does_not_fit(arguments):
     cost = Cost(**({"stage_weight": [1.0, 1.0, 0.1]} | arguments))
-    with pytest.raises(QPError, match=f"^{message}"):
-        Scheme(LAYOUT, MODEL, cost)
+    Scheme(LAYOUT, MODEL, cost)
 
 
 def test_an_asymmetry_is_relative_to_its_row_and_column():

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
+from tests.refused import refused
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.identification.learned import LearnedModel
@@ -351,17 +352,13 @@ def test_what_needs_one_model_refuses_dynamics():
         torch.func.grad(lambda s: mpc.value(s).sum())(states(mpc))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"dynamics": 3}, "dynamics: got 3, expected a function"),
-        ({"dynamics": lambda x, u: x[0]}, "x\\+ and l of shapes"),
-        ({"dynamics": lambda x, u: (x, x)}, "x\\+ and l of shapes"),
-        ({"iterations": 0}, "iterations: got 0"),
-        ({"learn": ("C",)}, "learn: got 'C' beside dynamics"),
-        ({"action_levels": [[0.0, 1.0]]}, "action_levels: got levels beside dynamics"),
-    ],
+@refused(
+    ({"dynamics": 3}, "dynamics: got 3, expected a function"),
+    ({"dynamics": lambda x, u: x[0]}, ".*x\\+ and l of shapes"),
+    ({"dynamics": lambda x, u: (x, x)}, ".*x\\+ and l of shapes"),
+    ({"iterations": 0}, "iterations: got 0"),
+    ({"learn": ("C",)}, "learn: got 'C' beside dynamics"),
+    ({"action_levels": [[0.0, 1.0]]}, "action_levels: got levels beside dynamics"),
 )
-def test_invalid_arguments_are_errors(options, message):
-    with pytest.raises(QPError, match=message):
-        made(**options)
+def test_invalid_arguments_are_errors(options):
+    made(**options)

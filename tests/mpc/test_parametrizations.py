@@ -3,7 +3,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.problems import normal
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.mpc.parametrizations import Cholesky, SquareRoot
 
 FACTOR = normal(4, 4)
@@ -56,17 +56,9 @@ def test_square_root_squares_entries_of_any_shape_and_sign():
     assert_close(SquareRoot()(SquareRoot().right_inverse(h)), h)
 
 
-@pytest.mark.parametrize(
-    ("kind", "value", "message"),
-    [
-        (SquareRoot(), torch.tensor([1.0, -0.5]), "diagonal: got -0.5, expected non-negative"),
-        (
-            Cholesky(),
-            torch.diag(torch.tensor([1.0, -0.5])),
-            "H: got smallest eigenvalue -0.5, expected a positive semidefinite matrix",
-        ),
-    ],
+@refused(
+    (SquareRoot(), torch.tensor([1.0, -0.5]), "diagonal: got -0.5, expected non-negative"),
+    (Cholesky(), torch.diag(torch.tensor([1.0, -0.5])), "H: got smallest eigenvalue -0.5, expecte"),
 )
-def test_a_start_that_is_not_semidefinite_is_named(kind, value, message):
-    with pytest.raises(QPError, match=message):
-        kind.right_inverse(value)
+def test_a_start_that_is_not_semidefinite_is_named(kind, value):
+    kind.right_inverse(value)

@@ -13,6 +13,7 @@ from torch.testing import assert_close
 
 from tests.covering import covering
 from tests.problems import normal, random_mpc, random_states
+from tests.refused import refused
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SolverError
 from torch_qpmpc.mpc import projections as steps
 from torch_qpmpc.mpc.parameters import leaves
@@ -253,14 +254,10 @@ def test_a_program_that_is_not_solved_is_not_silent(monkeypatch):
         nearest_psd_by_sdp(symmetric(4, 4))
 
 
-@pytest.mark.parametrize(
-    ("hessian", "value", "message"),
-    [
-        ("diagonal", torch.tensor([1.0, -2.0, 0.0]), "diagonal: got -2, expected non-negative"),
-        ("block", -torch.eye(3), "H: got smallest eigenvalue -1, expected a positive semidefinite"),
-    ],
+@refused(
+    ("diagonal", torch.tensor([1.0, -2.0, 0.0]), "diagonal: got -2, expected non-negative"),
+    ("block", -torch.eye(3), "H: got smallest eigenvalue -1, expected a positive semidefinite"),
 )
-def test_an_indefinite_weight_cannot_be_assigned(hessian, value, message):
+def test_an_indefinite_weight_cannot_be_assigned(hessian, value):
     mpc = random_mpc(step="projection", **HESSIANS[hessian])
-    with pytest.raises(QPError, match=message):
-        mpc.H = value.double()
+    mpc.H = value.double()

@@ -1,9 +1,9 @@
-import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torch_qpmpc import QPMPC, QPError
+from tests.refused import refused
+from torch_qpmpc import QPMPC
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 
 N = 4
@@ -89,20 +89,13 @@ def test_bounds_that_would_cross_meet_halfway_and_infinite_ones_stay():
     assert x[..., 1].isinf().all()
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: tighten(scheme(), SIGMA, 0.4), "probability: got 0.4, expected a probability in"),
-        (lambda: tighten(scheme(), SIGMA[1:]), "covariances: got shape .* expected shape"),
-        (lambda: tighten(scheme(), SIGMA / 0), "covariances: got NaN or inf, expected finite"),
-        (lambda: tighten(scheme(), SIGMA, K=SIGMA[0]), "K: got shape .* expected shape"),
-        (lambda: tighten(None, SIGMA), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
-        (
-            lambda: tighten(scheme(learn=("C", "ub")), SIGMA),
-            "mpc: got one that learns ub, expected",
-        ),
-    ],
+@refused(
+    (lambda: tighten(scheme(), SIGMA, 0.4), "probability: got 0.4, expected a probability in"),
+    (lambda: tighten(scheme(), SIGMA[1:]), "covariances: got shape .* expected shape"),
+    (lambda: tighten(scheme(), SIGMA / 0), "covariances: got NaN or inf, expected finite"),
+    (lambda: tighten(scheme(), SIGMA, K=SIGMA[0]), "K: got shape .* expected shape"),
+    (lambda: tighten(None, SIGMA), "mpc: got NoneType, expected a QPMPC"),  # pyright: ignore[reportArgumentType]
+    (lambda: tighten(scheme(learn=("C", "ub")), SIGMA), "mpc: got one that learns ub, expected"),
 )
-def test_a_mistake_is_named(call, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        call()
+def test_a_mistake_is_named(call):
+    call()

@@ -13,7 +13,8 @@ from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, stac
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, random_mpc, random_states
-from torch_qpmpc import QPMPC, QPError, QuadraticProgram, solve_qp
+from tests.refused import refused
+from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
@@ -180,19 +181,15 @@ def test_the_hessian_agrees_with_differences(twice):
         assert_close(found[..., i], central, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        (lambda mpc: hessian(mpc.policy), "derivative: got the second of the solution"),
-        (lambda mpc: jacrev(jacrev(mpc.policy)), "derivative: got the second of the solution"),
-        (lambda mpc: hessian(grad(mpc.value)), "or the third of the value, expected at most"),
-        (lambda mpc: jacfwd(jacfwd(mpc.value)), "got jvp in jvp, .* Use hessian, or jacrev inside"),
-    ],
+@refused(
+    (lambda mpc: hessian(mpc.policy), "derivative: got the second of the solution"),
+    (lambda mpc: jacrev(jacrev(mpc.policy)), "derivative: got the second of the solution"),
+    (lambda mpc: hessian(grad(mpc.value)), ".*or the third of the value, expected at most"),
+    (lambda mpc: jacfwd(jacfwd(mpc.value)), ".*got jvp in jvp, .* Use hessian, or jacrev inside"),
 )
-def test_derivatives_that_there_are_not_are_refused(function, message):
+def test_derivatives_that_there_are_not_are_refused(function):
     mpc = random_mpc(1)
-    with pytest.raises(QPError, match=message):
-        function(mpc)(random_states(1)[0])
+    function(mpc)(random_states(1)[0])
 
 
 def test_a_functional_call_never_reuses_another_thetas_preparation():
