@@ -156,62 +156,18 @@ def tangents(
     d_theta: Tangents, theta: Sequence[Tensor], solution: Sequence[Tensor], n_kept: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Return the tangents of value, z, chi, lam and xi from ``d_theta``, those of theta."""
-    z, chi, lam, xi, status = solution
-    sigma = slacks(z, *theta[5:9])
-    upper = upper_share(z, lam, *theta[5:8])
-    value = _value_tangent(d_theta, z, sigma, chi, lam, upper * lam, xi)
-    value = torch.where(status == 0, value, 0)
-    *right, saturated = _right_side(d_theta, z, lam, chi, xi, upper, theta[5], theta[8])
-    dz, dchi, dlam, dxi = kkt(*right, z, lam, status, *theta, n_kept)
-    return value, dz, dchi, dlam + saturated, dxi
-
-
-def _value_tangent(
-    d_theta: Tangents, z: Tensor, sigma: Tensor, chi: Tensor, lam: Tensor, eta: Tensor, xi: Tensor
-) -> Tensor:
+    pairs = zip(theta, d_theta, strict=True)
+    d_theta = [torch.zeros_like(x) if d is None else d for x, d in pairs]
     dH, dq, dc, dC, db, dG, dlb, dub, dw, dfixed = d_theta
-    total = z.new_zeros(z.shape[:-1])
-    if dc is not None:
-        total = total + dc
-    for matrix, left in ((dH, 0.5 * z), (dC, chi), (dG, lam)):
-        if matrix is not None:
-            total = total + (left * times(matrix, z)).sum(-1)
-    weights = (z, -chi, eta - lam, -eta, sigma, -xi)
-    for vector, weight in zip((dq, db, dlb, dub, dw, dfixed), weights, strict=True):
-        if vector is not None:
-            total = total + (weight * vector).sum(-1)
-    return total
-
-
-def _right_side(
-    d_theta: Tangents,
-    z: Tensor,
-    lam: Tensor,
-    chi: Tensor,
-    xi: Tensor,
-    upper: Tensor,
-    G: Tensor,
-    w: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return the right-hand side in the order z, lam, chi, xi, and dlam of saturated rows."""
-    dH, dq, _, dC, db, dG, dlb, dub, dw, dfixed = d_theta
-    right_z, right_lam, right_chi = (torch.zeros_like(x) for x in (z, lam, chi))
-    right_xi = torch.zeros_like(xi) if dfixed is None else dfixed.expand_as(xi)
-    saturated = torch.zeros_like(lam)
-    if dw is not None:
-        saturated = torch.where(saturated_rows(lam, w), lam.sign() * dw, 0)
-        right_z = right_z - times(G.mT, saturated)
-    if dH is not None:
-        right_z = right_z - times(dH + dH.mT, z) / 2
-    if dq is not None:
-        right_z = right_z - dq
-    for bound, share in ((dlb, 1 - upper), (dub, upper)):
-        if bound is not None:
-            right_lam = right_lam + torch.where(share > 0, share * bound, 0)
-    if db is not None:
-        right_chi = right_chi + db
-    if dC is not None:
-        right_z, right_chi = right_z - times(dC.mT, chi), right_chi - times(dC, z)
-    if dG is not None:
-        right_z, right_lam = right_z - times(dG.mT, lam), right_lam - times(dG, z)
-    return right_z, right_lam, right_chi, right_xi, saturated
+    z, chi, lam, xi, status = solution
+    upper, sigma = upper_share(z, lam, *theta[5:8]), slacks(z, *theta[5:9])
+    saturated = torch.where(saturated_rows(lam, theta[8]), lam.sign() * dw, 0)
+    Hz, Cz, Gz = times(dH + dH.mT, z) / 2, times(dC, z), times(dG, z)
+    bounds = torch.where(upper < 1, (1 - upper) * dlb, 0) + torch.where(upper > 0, upper * dub, 0)
+    of_z = z * (Hz / 2 + dq)
+    value = dc + of_z.sum(-1) + (chi * (Cz - db)).sum(-1) + (lam * (Gz - bounds)).sum(-1)
+    value = value + (sigma * dw).sum(-1) - (xi * dfixed).sum(-1)
+    right_z = -(Hz + dq + times(dC.mT, chi) + times(dG.mT, lam) + times(theta[5].mT, saturated))
+    right = right_z, bounds - Gz, db - Cz, dfixed.expand_as(xi)
+    dz, dchi, dlam, dxi = kkt(*right, z, lam, status, *theta, n_kept)
+    return torch.where(status == 0, value, 0), dz, dchi, dlam + saturated, dxi
