@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, flatten_batch, schema, times
-from torch_qpmpc.qp.kernels.batched import hold, largest, multiply
+from torch_qpmpc.qp.kernels.batched import hold, largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
@@ -25,8 +25,8 @@ from torch_qpmpc.qp.tracing import has_values, is_differentiating
 REGULAR = 1e-12
 #: .. after so many solves of the same system: the first, and a refinement.
 PASSES = 2
-#: A KKT system whose solution has a larger relative residual counts as singular.
-SINGULAR = 1e-8
+#: H is flat in a direction whose curvature is, relative to its largest entry, below this.
+FLAT = 1e-14
 #: A row is at its bound within this fraction of its size, the certificate's tolerance.
 AT_BOUND = TOLERANCE
 #: Unit normals that differ by at most this are parallel: data in float32 are no more accurate.
@@ -176,12 +176,9 @@ def _solve_active(
 ) -> tuple[Tensor, Tensor]:
     """Solve ``H v + G't = right_v, G v = right_t``; t and right_t are zero in inactive rows.
 
-    H is factorised once for each theta, and the Schur complement of the active rows for each QP,
-    unless every QP has a theta of its own.
+    H is factorised once for each theta, and the Schur complement of the active rows for each QP.
     """
     group = to_tensor(programs.group)
-    if 1 < len(H) == len(group):
-        return _solve_dense(H[group], G[group], active, right_v, right_t)
     to_g, to_lam = map(to_tensor, programs.prepared.sensitivities(programs.n_f))
     rows = to_tensor(programs.prepared.reduced(programs.n_f).rows)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
@@ -200,7 +197,9 @@ def _solve_active(
         regular = (largest(of_v) <= REGULAR * terms) & (of_t.abs() <= REGULAR * of_rows).all(-1)
         if regular.all():
             break
-    if (again := ~regular | _is_strained(largest(G)[group], t, terms)).any():
+    # Where terms of G't cancel to a fraction of their size, rows are dependent but for rounding.
+    strained = PARALLEL * largest(largest(G)[group] * t) > terms
+    if (again := ~regular | strained).any():
         index, rest = group[again], (x[again] for x in (active, right_v, right_t))
         v[again], t[again] = _solve_dense(H[index], G[index], *rest)
     return v, t
@@ -209,52 +208,20 @@ def _solve_active(
 def _solve_dense(
     H: Tensor, G: Tensor, active: Tensor, right_v: Tensor, right_t: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Do as `_solve_active`, also for dependent rows and directions without curvature."""
-    rows = active.any(dim=0).nonzero().squeeze(-1)
-    idle, right = ~active[:, rows], right_t[:, rows]
-    G = G[:, rows].masked_fill(idle.unsqueeze(-1), 0)
-    v, t_rows = _solve_rows(H, G, idle, right_v, right)
-    terms = largest(right_v) + largest(H.flatten(1)) * largest(v)
-    if (again := _is_strained(largest(G), t_rows, terms)).any():
-        # Rows that are dependent but for rounding, which would decide about v: an orthonormal basis
-        # of them, and of all t the one of least norm.
-        size = torch.linalg.vector_norm(G[again], dim=-1) + idle[again]
-        left, singular, basis = torch.linalg.svd(G[again] / size.unsqueeze(-1), full_matrices=False)
-        kept = singular > PARALLEL * singular[:, :1]
-        inverse = (left * (kept / singular.where(kept, 1)).unsqueeze(-2)) / size.unsqueeze(-1)
-        basis, of_basis = basis * kept.unsqueeze(-1), times(inverse.mT, right[again])
-        v[again], of_basis = _solve_rows(H[again], basis, ~kept, right_v[again], of_basis)
-        t_rows[again] = times(inverse, of_basis)
-    t = torch.zeros_like(right_t)
-    t[:, rows] = t_rows
-    return v, t
+    """Do as `_solve_active`, also for dependent rows and directions without curvature.
 
-
-def _is_strained(G_size: Tensor, t: Tensor, others: Tensor) -> Tensor:
-    """Return the mask of QPs in which terms of G't cancel to a fraction of their size, ``(B,)``.
-
-    ``others`` are the sizes of the other terms of ``H v + G't = right_v``.
+    Of all v and t it returns those of least norm.
     """
-    return PARALLEL * largest(G_size * t) > others
-
-
-def _solve_rows(
-    H: Tensor, G: Tensor, idle: Tensor, right_v: Tensor, right_t: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Solve ``H v + G't = right_v, G v = right_t``, with t = 0 in the ``idle`` rows."""
-    d = H.shape[-1]
-    top = torch.cat((H, G.mT), dim=-1)
-    kkt = torch.cat((top, torch.cat((G, torch.diag_embed(idle.to(H))), dim=-1)), dim=-2)
-    right = torch.cat((right_v, right_t), dim=-1).unsqueeze(-1)
-    solution = torch.linalg.solve_ex(kkt, right)[0]
-    error = (kkt @ solution - right).abs().amax(dim=(-2, -1)) if kkt.numel() else right.new_zeros(0)
-    bound = SINGULAR * (1 + right.abs().amax(dim=(-2, -1))) if kkt.numel() else error
-    singular = ~(error <= bound)
-    if singular.any():
-        # Dependent active rows or directions without curvature: take the least-norm solution.
-        inverse = torch.linalg.pinv(kkt[singular], hermitian=True)
-        solution[singular] = inverse @ right[singular]
-    return solution[:, :d, 0], solution[:, d:, 0]
+    rows = active.any(dim=0).nonzero().squeeze(-1)
+    A = G[:, rows].masked_fill(~active[:, rows].unsqueeze(-1), 0)
+    size = torch.linalg.vector_norm(A, dim=-1)
+    size = size.where(size > 0, 1)
+    of_A, of_H, _ = null_space_inverses(H, A / size.unsqueeze(-1), PARALLEL, FLAT)
+    v = times(of_A, right_t[:, rows] / size)
+    v = v + times(of_H, right_v - times(H, v))
+    t = torch.zeros_like(right_t)
+    t[:, rows] = times(of_A.mT, right_v - times(H, v)) / size
+    return v, t
 
 
 NAMES = ("grad_z", "grad_lam", "grad_chi", "grad_xi", "z", "lam", "status", *EVENT_SHAPES, "fixed")

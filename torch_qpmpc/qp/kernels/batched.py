@@ -23,6 +23,30 @@ def largest(x: Tensor, *, keepdim: bool = False) -> Tensor:
     return x.new_zeros((*x.shape[:-1], 1) if keepdim else x.shape[:-1])
 
 
+def null_space_inverses(
+    H: Tensor, A: Tensor, singular: float, flat: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pseudo-inverses of A ``(B, k, d)``, and of H ``(B, d, d)`` on its null space.
+
+    With them ``z = A^+ b + H^+ (a - H A^+ b)`` and ``t = A^+'(a - H z)`` are the solution of least
+    norm of ``H z + A't = a, A z = b``. By the singular value decomposition of A, errors grow with
+    its condition number; that of the KKT matrix is its square. Rows are dependent below the
+    singular value ``singular``, relative to the largest, and H has no curvature below ``flat``,
+    relative to its largest entry.
+
+    Returns:
+        The two, and the rank of A, ``(B,)``.
+    """
+    left, sizes, right = torch.linalg.svd(A, full_matrices=True)
+    k, kept = sizes.shape[-1], sizes > singular * largest(sizes, keepdim=True)
+    share = (kept / sizes.where(kept, 1)).unsqueeze(-2)
+    inverse = (right[:, :k].mT * share) @ left[:, :, :k].mT
+    null = right.masked_fill(F.pad(kept, (0, A.shape[-1] - k)).unsqueeze(-1), 0)
+    least = flat * largest(H.flatten(1))
+    of_H = torch.linalg.pinv(null @ H @ null.mT, atol=least, rtol=0 * least, hermitian=True)
+    return inverse, null.mT @ of_H @ null, kept.sum(-1)
+
+
 def hold(to_lam, group, vy, held, level) -> tuple[Tensor, Tensor]:
     """Return v and y with the ``held`` rows at their levels, and their multipliers."""
     d, t = vy.shape[-1] - held.shape[-1], torch.zeros_like(level)

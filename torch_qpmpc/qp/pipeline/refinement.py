@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from torch_qpmpc.qp.kernels.batched import null_space_inverses
 from torch_qpmpc.qp.kernels.linalg import compiled
 from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
 from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, BatchSolution
@@ -201,9 +202,7 @@ class _System(NamedTuple):
 class _Solver(NamedTuple):
     """Factors of a KKT matrix ``[[H, A'], [A, 0]]``, scaled by ``scale`` on both sides.
 
-    The null-space method: with the singular value decomposition of A, whose right vectors are
-    range and null space, errors grow with the condition number of A; that of the KKT matrix is its
-    square. ``A`` and ``H_null`` are the pseudo-inverses of A, and of H on the null space of A.
+    ``A`` and ``H_null`` are the `null_space_inverses`.
     """
 
     scale: np.ndarray
@@ -219,17 +218,9 @@ class _Solver(NamedTuple):
         H, A = K[:n, :n], K[n:, :n]
         if not np.isfinite(K).all():
             return cls(scale, H, np.full_like(A.T, np.nan), H, False)
-        # In torch, which uses the caller's number of threads.
-        parts = torch.linalg.svd(torch.from_numpy(A), full_matrices=True)
-        left, singular, right = (x.numpy() for x in parts)
-        rank = int((singular > SINGULAR * singular.max(initial=0.0)).sum())
-        of_range, null = right[:rank].T, right[rank:].T
-        A_inverse = of_range / singular[:rank] @ left[:, :rank].T
-        eigenvalues, vectors = np.linalg.eigh(null.T @ H @ null)
-        flat = eigenvalues <= FLAT * np.abs(H).max(initial=0.0)
-        vectors = null @ vectors[:, ~flat]
-        H_null = vectors / eigenvalues[~flat] @ vectors.T
-        return cls(scale, H, A_inverse, H_null, rank < len(A))
+        parts = (torch.from_numpy(x)[None] for x in (H, A))
+        of_A, of_H, (rank,) = (x.numpy() for x in null_space_inverses(*parts, SINGULAR, FLAT))
+        return cls(scale, H, of_A[0], of_H[0], bool(rank < len(A)))
 
     def solve(self, right: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the solution, and the size of its scaled form."""
