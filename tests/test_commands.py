@@ -59,8 +59,7 @@ CANNOT = {
     "FMU of one's own",
     "python -m tests.benchmarks.toolboxes": "it compares packages that are not installed",
     "python3 -m venv .venv": "it makes an environment; .ci/run does, too",
-    "python -m tests.benchmarks.table": "a benchmark of minutes that cannot be shortened",
-    "python -m tests.benchmarks.one_state --write": "the same, with osqp, clarabel and casadi",
+    "python -m tests.benchmarks.one_state --write": "minutes, with osqp, clarabel and casadi",
     "python -m tests.benchmarks.solvers --write": "the same, with piqp, osqp, qpax and more",
     "python -m tests.benchmarks.gpu --write": "it needs a GPU",
     "python -m tests.benchmarks.public_logs FOLDER --write": "its logs are downloaded by hand",
@@ -115,6 +114,7 @@ SHORT = {
     "python docs/examples/torchrl/ddpg.py": Short("--updates 2 --seed 71"),
     "python docs/examples/torchrl/sac.py --id Pendulum-v1": Short("--updates 2 --seed 71"),
     # Benchmarks that can be shortened: one row of each.
+    "python -m tests.benchmarks.gradient --write": Short("--only daqp"),
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
     "python -m tests.benchmarks.closed_loops --seeds 16 17 18 19 20": Short(
         "--cases Gros-Zanon --seeds 71"

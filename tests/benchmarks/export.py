@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from tests.benchmarks.table import significant
+from tests.benchmarks.table import PAGE, significant
 from tests.campaign.exports import PROBLEMS
 from torch_qpmpc import QPMPC, CompiledPolicy, export_c
 from torch_qpmpc.export.comparison import actions, reference
@@ -27,7 +27,6 @@ from torch_qpmpc.export.library import required_compiler
 from torch_qpmpc.study.markdown import write_section
 
 HERE = Path(__file__).parent
-PAGE = HERE.parents[1] / "docs" / "benchmarks.md"
 CHOSEN = (
     "point mass, N = 10",
     "12 states, 4 actions, N = 10",

@@ -17,7 +17,6 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -28,10 +27,9 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import moreau
 from tests.benchmarks.problems import PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
-from tests.benchmarks.table import significant
+from tests.benchmarks.table import PAGE, significant
 from torch_qpmpc.study.markdown import table, write_section
 
-PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 GPU = torch.device("cuda")
 BATCHES = (4_096, 65_536, 262_144)
 #: The batch of the comparison, and of the peers' rows: qpax needs more memory.

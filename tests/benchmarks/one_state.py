@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
@@ -24,16 +25,15 @@ import torch
 
 import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
-from tests.benchmarks.peers import needs
-from tests.benchmarks.solvers import PAGE
-from tests.benchmarks.table import significant
+from tests.benchmarks.peers import clarabel_step, osqp_step
+from tests.benchmarks.table import PAGE, significant
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers.daqp import NO_BOUND, RECIPROCAL_RHO, SOFT
 from torch_qpmpc.study.markdown import table, write_section
 
 STEPS, FEW, BLOCK, KICK, PASSES = 10_000, 200, 200, 50, 3
 SIZES = {"N = 10, 2 states": (10, 2, 1), "N = 50, 8 states": (50, 8, 2)}
-EPS = 1e-6
+
 Step = Callable[[int], Any]
 
 
@@ -61,44 +61,9 @@ def visited(mpc: qm.QPMPC) -> np.ndarray:
     return states
 
 
-def osqp_step(full: FullSpace) -> Step:
-    """Make OSQP, warm-started, at tolerances of `EPS`."""
-    solver = needs("osqp").OSQP()
-    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
-    lower, upper = np.hstack((b, lower)), np.hstack((b, upper))
-    rows = sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy())
-    Q = sp.triu(sp.csc_matrix(full.Q.detach().numpy()), format="csc")
-    solver.setup(Q, p[0], rows, lower[0], upper[0], verbose=False, eps_abs=EPS, eps_rel=EPS)
-
-    def step(k: int) -> np.ndarray:
-        solver.update(q=p[k], l=lower[k], u=upper[k])
-        return solver.solve().x
-
-    return step
-
-
-def clarabel_step(full: FullSpace) -> Step:
-    """Make Clarabel at its default tolerances, set up again in each step."""
-    clarabel = needs("clarabel")
-    Q, A, G = (sp.csc_matrix(x.detach().numpy()) for x in (full.Q, full.A, full.G))
-    p, b, lower, upper = (x.detach().numpy() for x in (full.p, full.b, full.l, full.u))
-    above, below = np.isfinite(upper[0]), np.isfinite(lower[0])
-    rows: Any = sp.csc_matrix(sp.vstack((A, G[above], -G[below])))
-    n_b = len(b[0])
-    cones = [clarabel.ZeroConeT(n_b), clarabel.NonnegativeConeT(rows.shape[0] - n_b)]
-    settings, Q = clarabel.DefaultSettings(), sp.csc_matrix(sp.triu(Q))
-    settings.verbose = False
-
-    def step(k: int) -> np.ndarray:
-        level = np.concatenate((b[k], upper[k, above], -lower[k, below]))
-        return np.array(clarabel.DefaultSolver(Q, p[k], rows, level, cones, settings).solve().x)
-
-    return step
-
-
 def casadi_step(full: FullSpace) -> Step:
     """Make CasADi's own sparse active-set method, QRQP, warm-started."""
-    casadi = needs("casadi")
+    casadi = import_module("casadi")
     p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
     Q = casadi.DM(sp.csc_matrix(full.Q.detach().numpy()))
     A = casadi.DM(sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy()))

@@ -1,11 +1,10 @@
 """Other packages' differentiable QPs, each as a function from a QP and fixed entries to values."""
 
 from collections.abc import Callable
-from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
-import pytest
 import qpsolvers
 import scipy.sparse as sp
 import torch
@@ -20,14 +19,9 @@ Values = Callable[[QuadraticProgram, Tensor], Tensor]
 CURVATURE = 1e-8
 
 
-def needs(module: str) -> Any:
-    """Import the module, or skip the test."""
-    return pytest.importorskip(module, reason=f"{module} is not installed: pip install '.[peers]'")
-
-
 def proxsuite() -> Values:
     """Make ProxSuite's own torch layer, with its default settings."""
-    layer = needs("proxsuite.torch.qplayer").QPFunction()
+    layer = import_module("proxsuite.torch.qplayer").QPFunction()
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
         full = FullSpace.of(qp, fixed)
@@ -37,7 +31,7 @@ def proxsuite() -> Values:
 
 
 def qpth() -> Values:
-    layer = needs("qpth.qp").QPFunction(verbose=-1, check_Q_spd=False)
+    layer = import_module("qpth.qp").QPFunction(verbose=-1, check_Q_spd=False)
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
         full = FullSpace.of(qp, fixed)
@@ -52,7 +46,7 @@ def qpth() -> Values:
 
 def cvxpylayers() -> Values:
     """Compile the QP as printed in eq:qp2 once for V and once for Q; the solver is Clarabel."""
-    CvxpyLayer = needs("cvxpylayers.torch").CvxpyLayer
+    CvxpyLayer = import_module("cvxpylayers.torch").CvxpyLayer
     layers: dict[int, Any] = {}
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
@@ -96,7 +90,7 @@ def clarabel() -> Values:
 
     The Lagrangian with x and the multipliers held has the value's gradient.
     """
-    needs("clarabel")
+    import_module("clarabel")
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
         full = FullSpace.of(qp, fixed)
@@ -116,7 +110,7 @@ def clarabel() -> Values:
 
 def moreau(device: str = "cpu", solver: str = "active_set") -> Values:
     """Make Moreau's torch layer, at its default tolerances, for each size of a batch."""
-    package, Solver = needs("moreau"), needs("moreau.torch").Solver
+    package, Solver = import_module("moreau"), import_module("moreau.torch").Solver
     layers: dict[torch.Size, Any] = {}
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:
@@ -148,12 +142,19 @@ PEERS: dict[str, Callable[[], Values]] = {
 }
 
 
-def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
-    """Make PIQP's sparse solver in full space: one setup, a solve per sample, values ``(B,)``.
+#: Solves QP k of a batch in full space, and returns x.
+Step = Callable[[int], np.ndarray]
 
-    The rows of sigma >= 0, and those of hard rows, are bounds on x.
-    """
-    piqp = needs("piqp")
+
+def values_of(full: FullSpace, step: Step) -> Callable[[], Tensor]:
+    """Make a function that solves all QPs, one at a time, and returns values ``(B,)``."""
+    every = range(len(full.p))
+    return lambda: full.value(torch.from_numpy(np.array([step(k) for k in every]))).detach()
+
+
+def piqp_step(full: FullSpace) -> Step:
+    """Make PIQP's sparse solver: one setup. Rows of sigma >= 0, and hard rows, are bounds on x."""
+    piqp = import_module("piqp")
     Q, A, G = (sp.csc_matrix(matrix.detach().numpy()) for matrix in (full.Q, full.A, full.G))
     p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
     lower, upper = (np.where(abs(v) < INFINITE, v, np.copysign(np.inf, v)) for v in (lower, upper))
@@ -167,27 +168,22 @@ def piqp_solver(full: FullSpace) -> Callable[[], Tensor]:
     G, lower, upper = sp.csc_matrix(G[~single]), lower[:, ~single], upper[:, ~single]
     solver = piqp.SparseSolver()
 
-    def arguments(i: int) -> dict[str, Any]:
-        vectors = {"c": p[i], "b": b[i], "h_l": lower[i], "h_u": upper[i]}
-        return vectors | {"x_l": x_l[i], "x_u": x_u[i]}
+    def arguments(k: int) -> dict[str, Any]:
+        vectors = {"c": p[k], "b": b[k], "h_l": lower[k], "h_u": upper[k]}
+        return vectors | {"x_l": x_l[k], "x_u": x_u[k]}
 
-    setup = partial(solver.setup, P=Q, A=A, G=G)
-    setup(**arguments(0))
+    def step(k: int) -> np.ndarray:
+        solver.update(**arguments(k))
+        solver.solve()
+        return np.array(solver.result.x)
 
-    def values() -> Tensor:
-        x = np.empty_like(p)
-        for i in range(len(p)):
-            solver.update(**arguments(i))
-            solver.solve()
-            x[i] = solver.result.x
-        return full.value(torch.from_numpy(x)).detach()
-
-    return values
+    solver.setup(P=Q, A=A, G=G, **arguments(0))
+    return step
 
 
-def clarabel_solver(full: FullSpace, tolerance: float) -> Callable[[], Tensor]:
-    """Make Clarabel in full space, set up for each QP: a function that returns values ``(B,)``."""
-    clarabel = needs("clarabel")
+def clarabel_step(full: FullSpace, tolerance: float = 1e-8) -> Step:
+    """Make Clarabel, set up again for each QP; its default tolerances are 1e-8."""
+    clarabel = import_module("clarabel")
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
@@ -197,13 +193,27 @@ def clarabel_solver(full: FullSpace, tolerance: float) -> Callable[[], Tensor]:
     right = torch.cat((full.b, h), dim=1).detach().numpy()
     cones = [clarabel.ZeroConeT(len(full.A)), clarabel.NonnegativeConeT(len(G))]
 
-    def values() -> Tensor:
-        x = []
-        for i in range(len(p)):
-            solution = clarabel.DefaultSolver(Q, p[i], rows, right[i], cones, settings).solve()
-            if "Solved" not in str(solution.status):
-                raise RuntimeError(f"Clarabel: {solution.status}")
-            x.append(solution.x)
-        return full.value(torch.tensor(x, dtype=torch.float64)).detach()
+    def step(k: int) -> np.ndarray:
+        solution = clarabel.DefaultSolver(Q, p[k], rows, right[k], cones, settings).solve()
+        if "Solved" not in str(solution.status):
+            raise RuntimeError(f"Clarabel: {solution.status}")
+        return np.array(solution.x)
 
-    return values
+    return step
+
+
+def osqp_step(full: FullSpace, **options: Any) -> Step:
+    """Make OSQP at tolerances of 1e-6, warm-started unless ``options`` say otherwise."""
+    solver = import_module("osqp").OSQP()
+    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
+    lower, upper = np.hstack((b, lower)), np.hstack((b, upper))
+    rows = sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy())
+    Q = sp.triu(sp.csc_matrix(full.Q.detach().numpy()), format="csc")
+    options = {"verbose": False, "eps_abs": 1e-6, "eps_rel": 1e-6, **options}
+    solver.setup(Q, p[0], rows, lower[0], upper[0], **options)
+
+    def step(k: int) -> np.ndarray:
+        solver.update(q=p[k], l=lower[k], u=upper[k])
+        return solver.solve().x
+
+    return step

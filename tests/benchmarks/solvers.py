@@ -15,26 +15,24 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
+from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from torch import Tensor
 
 from tests.benchmarks.full_space import FullSpace
-from tests.benchmarks.peers import clarabel_solver, cvxpylayers, needs, piqp_solver
+from tests.benchmarks.peers import clarabel_step, cvxpylayers, osqp_step, piqp_step, values_of
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import reference_values, relative_error
-from tests.benchmarks.table import significant
+from tests.benchmarks.table import PAGE, significant
 from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
 from torch_qpmpc.study.markdown import table, write_section
 
-PAGE = Path(__file__).parents[2] / "docs" / "benchmarks.md"
 #: QPs in our batches, in the others' loops, and compared with the reference.
 BATCH, LOOP, CHECKED = 32, 4, 2
 ROUNDS, PATIENCE = 5, 1.0
@@ -44,29 +42,9 @@ CASES = ((False, 20), (False, 200), (True, 5), (True, 20), (True, 100))
 Solve = Callable[[], Tensor]
 
 
-def osqp_solver(full: FullSpace) -> Solve:
-    """Make OSQP, without warm starts, at tolerances of 1e-6."""
-    solver = needs("osqp").OSQP()
-    p, b, lower, upper = (v.detach().numpy() for v in (full.p, full.b, full.l, full.u))
-    lower, upper = np.hstack((b, lower)), np.hstack((b, upper))
-    rows = sp.csc_matrix(torch.cat((full.A, full.G)).detach().numpy())
-    Q = sp.triu(sp.csc_matrix(full.Q.detach().numpy()), format="csc")
-    options = {"eps_abs": 1e-6, "eps_rel": 1e-6, "max_iter": 100_000, "warm_starting": False}
-    solver.setup(Q, p[0], rows, lower[0], upper[0], verbose=False, **options)
-
-    def values() -> Tensor:
-        x = np.empty_like(p)
-        for i in range(len(p)):
-            solver.update(q=p[i], l=lower[i], u=upper[i])
-            x[i] = solver.solve().x
-        return full.value(torch.from_numpy(x))
-
-    return values
-
-
 def qpax_solver(full: FullSpace) -> Solve:
     """Make qpax, dense, compiled for the batch, in float64."""
-    jax, qpax = needs("jax"), needs("qpax")
+    jax, qpax = import_module("jax"), import_module("qpax")
     jax.config.update("jax_enable_x64", True)
     G, h = full.one_sided()
     Q, A, G = (matrix.numpy() for matrix in (full.Q, full.A, G))
@@ -77,11 +55,13 @@ def qpax_solver(full: FullSpace) -> Solve:
 
 #: Other packages' solvers in full space, by the package that they need.
 PEERS: dict[str, tuple[str, Callable[[FullSpace], Solve]]] = {
-    "PIQP, sparse": ("piqp", piqp_solver),
-    "Clarabel": ("clarabel", partial(clarabel_solver, tolerance=1e-8)),
-    "OSQP": ("osqp", osqp_solver),
+    "PIQP, sparse": ("piqp", lambda full: values_of(full, piqp_step(full))),
+    "Clarabel": ("clarabel", lambda full: values_of(full, clarabel_step(full))),
+    "OSQP": ("osqp", lambda full: values_of(full, osqp_step(full, **COLD))),
     "qpax": ("qpax", qpax_solver),
 }
+#: OSQP's options.
+COLD = {"max_iter": 100_000, "warm_starting": False}
 #: Its compilation for parametric matrices takes tens of GiB for z with more entries than this.
 LAYERS, LARGEST = "cvxpylayers", 500
 CONDENSING = "condensing, a new theta"
