@@ -1,7 +1,5 @@
 """`Controller`: offsets, names, bumpless starts, and messages."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np

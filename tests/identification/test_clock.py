@@ -1,7 +1,5 @@
 """Times as loggers write them."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Models identified from logs, and QPs that start from them."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

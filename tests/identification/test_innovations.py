@@ -1,7 +1,5 @@
 """Identified state-space models in innovations form, and their filter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg

@@ -1,7 +1,5 @@
 """Learned dynamics: networks where they predict better than a linear model, and what uses them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The parts of a log."""
 
-from __future__ import annotations
-
 import torch
 from torch.testing import assert_close
 

@@ -1,7 +1,5 @@
 """Logs of TorchRL's steps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

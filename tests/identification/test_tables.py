@@ -1,7 +1,5 @@
 """Logs from CSV files, DataFrames and arrays."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -3,8 +3,6 @@
 It gives what the compiled path gives, and leaves the rest to that.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

@@ -1,7 +1,5 @@
 """One test for each read of torch's internals: it fails when torch changes what is read."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The compiled loops against their torch forms, and the certificate against a short reference."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refinement in twice the working precision, and the QPs that only it solves."""
 
-from __future__ import annotations
-
 import functools
 import json
 from dataclasses import replace
