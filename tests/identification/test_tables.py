@@ -11,6 +11,7 @@ from torch.testing import assert_close
 
 import torch_qpmpc as qm
 from tests.logs import NAMES, arx_log, lengths, room
+from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.identification.log import Log
 
@@ -236,81 +237,69 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
     assert len(log.notes) == 1 + len(caught)
 
 
-@pytest.mark.parametrize(
-    ("data", "options", "message"),
-    [
-        (5, {}, "data: got int, expected a CSV file, a DataFrame, a dict of arrays, a list"),
-        ([], {}, "data: got an empty list, expected a CSV file"),
-        ("none.csv", {}, r"data: got none.csv, which cannot be read \(.*No such file"),
-        ("http://a.b/c.csv", {}, r"data: got http://a.b/c.csv, which cannot be read"),
-        (room(), {"outputs": ["p"]}, "column: got 'p', which is missing, expected one of t, T, q,"),
-        (room(), {"inputs": ["T"]}, "column: got 'T' twice, expected each once"),
-        (room(), {"outputs": None}, "outputs: got none, and columns t, T, q, T_out, expected nam"),
-        (room(), {"inputs": None}, r"inputs: got none, .* Pass read_log\(.., inputs=\[..\]\)"),
-        (room(), {"time": "clock"}, "column: got 'clock', which is missing"),
-        (room(), {"episode": "run"}, "column: got 'run', which is missing"),
-        (room().assign(q="on"), {}, "column: got q, without a number"),
-        *(
-            (room().assign(q=[text, *map(str, range(59))]), {}, f"column: got q with '{text}' in 1")
-            for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
-        ),
-        *(
-            (
-                room().assign(t=t),
-                {"time": "t"},
-                f"time: got t with '{t}', expected numbers or dates",
-            )
-            for t in ("noon", "12:xx")
-        ),
-        *(
-            (
-                room().assign(t=[*range(full), *[None] * (60 - full)]),
-                {"time": "t"},
-                f"time: got t, empty in {60 - full} of 60 rows, expected times in two rows or more",
-            )
-            for full in (0, 1)
-        ),
+@refused(
+    (5, {}, "data: got int, expected a CSV file, a DataFrame, a dict of arrays, a list"),
+    ([], {}, "data: got an empty list, expected a CSV file"),
+    ("none.csv", {}, r"data: got none.csv, which cannot be read \(.*No such file"),
+    ("http://a.b/c.csv", {}, r"data: got http://a.b/c.csv, which cannot be read"),
+    (room(), {"outputs": ["p"]}, "column: got 'p', which is missing, expected one of t, T, q,"),
+    (room(), {"inputs": ["T"]}, "column: got 'T' twice, expected each once"),
+    (room(), {"outputs": None}, "outputs: got none, and columns t, T, q, T_out, expected nam"),
+    (room(), {"inputs": None}, r"inputs: got none, .* Pass read_log\(.., inputs=\[..\]\)"),
+    (room(), {"time": "clock"}, "column: got 'clock', which is missing"),
+    (room(), {"episode": "run"}, "column: got 'run', which is missing"),
+    (room().assign(q="on"), {}, "column: got q, without a number"),
+    *(
+        (room().assign(q=[text, *map(str, range(59))]), {}, f"column: got q with '{text}' in 1")
+        for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
+    ),
+    *(
         (
-            room().assign(t=["2020-09-01", *["13/09/2020"] * 59]),
+            room().assign(t=t),
             {"time": "t"},
-            "time: got t with '2020-09-01', expected numbers or dates of one format",
-        ),
-        *(
-            (
-                room().assign(t=np.r_[np.arange(30), 30 + step * np.arange(30)]),
-                {"time": "t"},
-                f"time: got steps of {step} from row 30 on, and of 1 in the median, expected one",
-            )
-            for step in (1.45, 1.2, 0.1, 3)
-        ),
+            f"time: got t with '{t}', expected numbers or dates",
+        )
+        for t in ("noon", "12:xx")
+    ),
+    *(
         (
-            {"T": torch.ones(9).requires_grad_(), "q": np.arange(9)},
-            {},
-            r"T: got a tensor that requires grad, expected one without. Pass T.detach\(\)",
-        ),
-        (room()[::-1], {"time": "t"}, "time: got steps of -0.25, expected times that increase"),
-        (
-            [room(), room(30).assign(t=0.5 * np.arange(30))],
+            room().assign(t=[*range(full), *[None] * (60 - full)]),
             {"time": "t"},
-            "time: got steps of 0.5 from row 60 on, and of 0.25 in the median, expected one samp",
-        ),
+            f"time: got t, empty in {60 - full} of 60 rows, expected times in two rows or more",
+        )
+        for full in (0, 1)
+    ),
+    (
+        room().assign(t=["2020-09-01", *["13/09/2020"] * 59]),
+        {"time": "t"},
+        "time: got t with '2020-09-01', expected numbers or dates of one format",
+    ),
+    *(
         (
-            room(1),
-            {},
-            "data: got 1 rows, of which no two have outputs and all inputs between them, exp",
-        ),
-        ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),
-        ({"T": np.ones(9), "q": np.ones(7)}, {}, "q: got 7 rows, expected 9 rows, as others, or 8"),
-        (
-            pd.concat([room(), room()[["T"]]], axis=1),
-            {},
-            "column: got 'T', which is there twice, expected one of",
-        ),
-    ],
+            room().assign(t=np.r_[np.arange(30), 30 + step * np.arange(30)]),
+            {"time": "t"},
+            f"time: got steps of {step} from row 30 on, and of 1 in the median, expected one",
+        )
+        for step in (1.45, 1.2, 0.1, 3)
+    ),
+    (
+        {"T": torch.ones(9).requires_grad_(), "q": np.arange(9)},
+        {},
+        r"T: got a tensor that requires grad, expected one without. Pass T.detach\(\)",
+    ),
+    (room()[::-1], {"time": "t"}, "time: got steps of -0.25, expected times that increase"),
+    (
+        [room(), room(30).assign(t=0.5 * np.arange(30))],
+        {"time": "t"},
+        "time: got steps of 0.5 from row 60 on, and of 0.25 in the median, expected one samp",
+    ),
+    (room(1), {}, "data: got 1 rows, of which no two have outputs and all inputs between them, ex"),
+    ({"T": np.zeros((2, 3, 4))}, {}, r"T: got shape \(2, 3, 4\), expected shape \(T,\) or"),
+    ({"T": np.ones(9), "q": np.ones(7)}, {}, "q: got 7 rows, expected 9 rows, as others, or 8"),
+    (pd.concat([room(), room()[["T"]]], axis=1), {}, "column: got 'T', which is there twice, expe"),
 )
-def test_a_mistake_is_named(data, options, message):
-    with pytest.raises(QPError, match=f"^{message}"):
-        qm.read_log(data, **{**NAMES, **options})
+def test_a_mistake_is_named(data, options):
+    qm.read_log(data, **{**NAMES, **options})
 
 
 # Where logs are taken
