@@ -15,6 +15,7 @@ from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
 from tests.runs import SMALL, ended, make_config
 from torch_qpmpc.experiment.tasks import TASKS
 from torch_qpmpc.experiment.tasks.code import named_task
+from torch_qpmpc.identification import learned
 from torch_qpmpc.proofs import invariant
 from torch_qpmpc.qp import solvers
 
@@ -55,6 +56,7 @@ def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
     monkeypatch.setattr(solvers, "BACKENDS", dict(solvers.BACKENDS))
     monkeypatch.setattr(invariant, "GAINS", (1.0,))  # saturated laws take longer
+    monkeypatch.setattr(learned, "STEPS", 500)
     namespace: dict[str, object] = {"__name__": "page"}
     for line, code in fenced(PAGES[page], "python"):
         # Blank lines first, so that a traceback names the page's own line.

@@ -110,7 +110,8 @@ def test_c_keeps_them_alike():
         assert np.abs(got - u).max() < 1e-8
         assert u @ [1.0, 2.0] <= 1.5 + 1e-9
         held += u @ [1.0, 2.0] > 1.5 - 1e-6
-        prices |= {limit.signal for limit in controller.explain().limits}
+        if k % 5 == 0:
+            prices |= {limit.signal for limit in controller.explain().limits}
         x = A @ x + B @ (u + load)
     assert held > 10
     assert prices >= {"power", "mixed", "end"}

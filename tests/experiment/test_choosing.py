@@ -231,7 +231,7 @@ def trained(cfg, folder) -> FinishedRun:
 def check_predict(run):
     """Run episodes by ``run.predict``, which holds the filter and the plan."""
     for seed in (5, 6):
-        options: Any = {"steps": 20, "starts": 1, "seed": seed}
+        options: Any = {"steps": 9, "starts": 1, "seed": seed}
         loop = gymnasium_loop(warm_policy(run.policy), run.physics, **options)
         env = run.physics.make()
         (y, _), costs = env.reset(seed=seed), []

@@ -1,5 +1,6 @@
 """Actions on levels: V, Q and the policy equal enumeration, and gradients finite differences."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -42,6 +43,7 @@ def drawn(seed: int, horizon: int = N, most: int = 70_000) -> tuple[qm.QPMPC, to
     return mpc, torch.from_numpy(2 * rng.normal(size=n_x))
 
 
+@functools.cache
 def sequences_of(count: int, off: int, on: int, horizon: int) -> np.ndarray:
     """Return all sequences of levels that keep minimum times, ``(n, horizon)``."""
     found = [()]

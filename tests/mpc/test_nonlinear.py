@@ -176,16 +176,14 @@ def test_gradients_equal_finite_differences(case, place):
         "Q": lambda: mpc.action_value(s, a),
         "pi": lambda: mpc.policy(s),
     }
-    of_theta, generator = [*mpc.parameters()], torch.Generator().manual_seed(1)
+    point, generator = [s.requires_grad_(), *mpc.parameters()], torch.Generator().manual_seed(1)
     for name, function in functions.items():
-        points: Any = [s.requires_grad_()], of_theta
-        for point in points:
-            change = [torch.randn(x.shape, generator=generator).to(x) for x in point]
-            found = torch.autograd.grad(function().sum(), point, allow_unused=True)
-            pairs = zip(found, change, strict=True)
-            own = torch.stack([(x * dx).sum() for x, dx in pairs if x is not None]).sum()
-            other = slope_along(function, point, change)
-            assert_close(own, other, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
+        change = [torch.randn(x.shape, generator=generator).to(x) for x in point]
+        found = torch.autograd.grad(function().sum(), point, allow_unused=True)
+        pairs = zip(found, change, strict=True)
+        own = torch.stack([(x * dx).sum() for x, dx in pairs if x is not None]).sum()
+        other = slope_along(function, point, change)
+        assert_close(own, other, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
 
 
 def test_a_saddle_says_that_the_plan_has_no_gradient():
