@@ -74,7 +74,7 @@ def quick_exports() -> Iterator[None]:
             patch.setattr(module, "FLAGS", ("-std=c99", "-O0", "-fPIC", "-shared"))
             patch.setattr(module, "compiled", compiled)
         for module in (exporting, comparison):
-            patch.setattr(module, "COMPARED", 60)
+            patch.setattr(module, "COMPARED", 40)
         yield
 
 
@@ -161,6 +161,14 @@ def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
             patch.setattr(Figure, "savefig", save_small)
             patch.setitem(matplotlib.rcParams, "figure.dpi", SMALL_DPI)
         yield
+
+
+@pytest.fixture
+def fresh_dynamo() -> Iterator[None]:
+    """Forget what torch.compile has compiled, before and after a test."""
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
 
 
 @pytest.fixture

@@ -160,10 +160,6 @@ LOSSES: dict[str, Callable[[], LossModule]] = {
     ),
     "value of PPO, with a preview": lambda: ClipPPOLoss(network_gaussian(), value(**PREVIEW)),
 }
-#: On-policy losses, whose default estimator is GAE.
-ON_POLICY = [name for name in LOSSES if any(x in name for x in ("A2C", "PPO", "REINFORCE"))]
-#: Losses that call an ensemble under vmap.
-ENSEMBLES = [name for name in LOSSES if "critics" in name or "TD3" in name]
 
 
 def make_loss(name: str, estimator: str | None = None, seed: int = 0) -> LossModule:

@@ -159,19 +159,6 @@ def test_a_set_point_is_weighed_but_for_what_bounds_of_outputs_hold_off():
     assert np.allclose([own.y[0], own.r[0]], [1.0, 2.5]), "both pull the same way"
 
 
-def test_c_weighs_the_same_set_points_beside_zones():
-    controller, twin = exported(coupled, u_bounds=(-1.0, 0.8))
-    rng, x = np.random.default_rng(2), np.zeros(4)
-    plant, levels = controller.mpc.design.plant, rng.uniform(-2, 2, 8)
-    for k in range(64):
-        y, r = plant.C @ x + 0.01 * rng.normal(size=2), np.array([levels[k // 8], 0.0])
-        u = controller.step(y, r)
-        v, code = twin.step(y, r[None])
-        assert code == controller.status == 0
-        assert np.abs(u - v).max() < 1e-8
-        x = plant.A @ x + plant.B @ u + [0.0, 0.05, 0.0, 0.0]
-
-
 def test_zones_alone_rest_where_the_inputs_cost_least():
     names: Any = {"outputs": ["T", "h"], "inputs": ["p", "q"], "y_bounds": {"T": (1.0, 2.0)}}
     model = np.diag([0.9, 0.8]), np.array([[0.1, 0.02], [0.01, 0.2]])

@@ -1,20 +1,15 @@
 """The QP in TorchRL's losses: as critic, actor, mean and state value, and in ensembles."""
 
-import copy
 import io
-import itertools
-import pickle
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from torchrl.objectives import CQLLoss, HardUpdate, SoftUpdate
+from torchrl.objectives import CQLLoss
 
 from tests.losses import (
-    ENSEMBLES,
     LOSSES,
-    ON_POLICY,
     critic,
     make_batch,
     make_loss,
@@ -30,11 +25,6 @@ ROLES = (
     *("actor and critics of TD3", "mean and critics of SAC", "mean and value of PPO"),
     *("actor and critics of TD3, with a preview", "value of PPO, with a preview"),
 )
-OFF_POLICY = [name for name in ROLES if name not in ON_POLICY]
-UPDATERS: dict[str, Any] = {
-    "soft": lambda loss: SoftUpdate(loss, tau=0.25),
-    "hard": lambda loss: HardUpdate(loss, value_network_update_interval=1),
-}
 
 
 def learned(loss: Any) -> dict[str, Tensor]:
@@ -43,14 +33,6 @@ def learned(loss: Any) -> dict[str, Tensor]:
         name: parameter
         for name, parameter in loss.named_parameters()
         if parameter.requires_grad and not (name.startswith("actor") and name.endswith(".c"))
-    }
-
-
-def targets(loss: Any) -> dict[str, Tensor]:
-    return {
-        name: x.clone()
-        for name, x in loss.named_buffers()
-        if name.startswith("target_") and "_network_params" in name
     }
 
 
@@ -93,53 +75,6 @@ def test_training_moves_theta_can_be_repeated_and_saved(name):
     file.seek(0)
     fresh.load_state_dict(torch.load(file, weights_only=True))
     assert torch.equal(total(fresh, batch), trained)
-
-
-@pytest.mark.parametrize(
-    ("name", "updater"), zip(OFF_POLICY, itertools.cycle(UPDATERS), strict=False)
-)
-def test_targets_are_frozen_until_they_are_updated(name, updater):
-    loss = make_loss(name)
-    start = targets(loss)
-    assert start
-    update = UPDATERS[updater](loss)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=1e-4)
-    total(loss, make_batch(loss)).backward()
-    optimizer.step()
-    for key, target in targets(loss).items():
-        assert torch.equal(target, start[key]), key
-    for _ in range(2 if updater == "hard" else 1):
-        update.step()
-    share, moved = (1.0 if updater == "hard" else 0.25), 0
-    online = dict(loss.named_parameters())
-    for key, target in targets(loss).items():
-        source = online.get(key.removeprefix("target_"))
-        if source is None:  # a constant, such as the bounds
-            assert torch.equal(target, start[key]), key
-            continue
-        expected = start[key] + share * (source.detach() - start[key])
-        torch.testing.assert_close(target, expected, msg=key)
-        moved += not torch.equal(target, start[key])
-    assert moved
-
-
-@pytest.mark.parametrize("name", ROLES)
-def test_copies_are_equal_and_independent(name):
-    """TorchRL's ensembles hold a local function, which cannot be pickled; the others can."""
-    loss = make_loss(name)
-    batch = make_batch(loss)
-    before, twins = total(loss, batch), [copy.deepcopy(loss)]
-    if name in ENSEMBLES:
-        with pytest.raises((AttributeError, pickle.PicklingError), match="local object"):
-            pickle.dumps(loss)
-    else:
-        twins.append(pickle.loads(pickle.dumps(loss)))
-    with torch.no_grad():
-        for parameter in learned(loss).values():
-            parameter += 0.01
-    assert not torch.equal(total(loss, batch), before)
-    for twin in twins:
-        assert torch.equal(total(twin, batch), before)
 
 
 # --- Single losses and modules around them -------------------------------------------------------

@@ -189,6 +189,3 @@ def test_a_gradient_passes_through_a_warm_policy():
         for start in (start, None)
     )
     torch.testing.assert_close(warm, cold)
-
-
-# --- In TorchRL's collectors and losses ----------------------------------------------------------

@@ -157,21 +157,23 @@ def test_the_loss_is_that_of_the_residuals_by_hand():
     assert_close(loss(td)["loss_value"], 0.5 * (target - prediction).square().mean())
 
 
-def test_target_networks_hold_the_network_and_move_softly():
-    _, theta, operator = scheduled()
+@pytest.mark.parametrize("part", ["net.4.weight", "module.C"])
+def test_target_networks_hold_the_network_and_the_qp_and_move_softly(part):
+    mpc, theta, operator = scheduled()
     loss = QPQLearningLoss(critic_of(theta, operator), delay_value=True)
     loss.make_value_estimator(gamma=0.9)
     update = SoftUpdate(loss, tau=0.25)
 
     def last(params: Any) -> Tensor:
         found = params.flatten_keys(".").to_dict()
-        return next(x for name, x in found.items() if name.endswith("net.4.weight"))
+        return next(x for name, x in found.items() if name.endswith(part))
 
     target, online = loss.target_value_network_params, loss.value_network_params
     start = last(target).clone()
     assert torch.equal(start, last(online))
     with torch.no_grad():
         theta.net[-1].weight.add_(1.0)
+        mpc.C.add_(1.0)
     update.step()
     assert_close(last(target), start + 0.25)
 

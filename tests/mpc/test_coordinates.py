@@ -1,6 +1,6 @@
 """Residuals in theta's unconstrained coordinates: values, gradients, vmap, compile, messages."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -152,13 +152,6 @@ def test_vmap_over_states_and_residuals(kind):
         first = {name: x[0] for name, x in residuals.items()}
         by_theta = vmap(one, (None, None, 0))(s[0], a[0], residuals)
         assert_close(by_theta[0], one(s[0], a[0], first))
-
-
-@pytest.fixture
-def fresh_dynamo() -> Iterator[None]:
-    torch._dynamo.reset()
-    yield
-    torch._dynamo.reset()
 
 
 @pytest.mark.usefixtures("fresh_dynamo")

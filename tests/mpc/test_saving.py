@@ -120,11 +120,6 @@ def test_more_than_an_observation_is_an_error(observation):
         drawn_mpc(2, 1, 3).predict(observation)
 
 
-def test_nan_is_an_error():
-    with pytest.raises(QPError, match=r"^observation: got NaN or inf, expected finite numbers"):
-        drawn_mpc(2, 1, 3).predict([0.0, np.nan])
-
-
 def test_an_unsolved_qp_raises_even_if_it_is_masked():
     """A placeholder must not reach a plant."""
     bounds = {

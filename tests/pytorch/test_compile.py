@@ -1,6 +1,6 @@
 """`torch.compile(fullgraph=True)` gives the eager numbers, or an error."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,13 +15,7 @@ from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp.program import EVENT_SHAPES
 
 Function = Callable[[Tensor, Tensor], Tensor]
-
-
-@pytest.fixture(autouse=True)
-def fresh_dynamo() -> Iterator[None]:
-    torch._dynamo.reset()
-    yield
-    torch._dynamo.reset()
+pytestmark = pytest.mark.usefixtures("fresh_dynamo")
 
 
 def functions(mpc: QPMPC) -> dict[str, Function]:

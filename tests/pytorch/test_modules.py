@@ -11,7 +11,7 @@ from torch.func import vmap
 from torch.nn.utils import parametrize
 from torch.testing import assert_close
 
-from tests.problems import MIXED, drawn_mpc, random_mpc, random_states, step
+from tests.problems import MIXED, random_mpc, random_states, step
 from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -75,12 +75,6 @@ def test_a_module_comes_back_from_meta(kind, how):
     else:
         mpc.to("meta").to_empty(device="cpu").reset_parameters()
     assert_close(mpc.value(s), expected, rtol=0, atol=0)
-
-
-def test_a_module_is_made_on_the_default_device():
-    with torch.device("meta"):
-        mpc = drawn_mpc(2, 1, 3)
-    assert {part.device.type for part in (*mpc.parameters(), *mpc.buffers())} == {"meta"}
 
 
 @pytest.mark.parametrize("solver", BACKENDS)

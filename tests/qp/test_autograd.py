@@ -1,14 +1,12 @@
 import gc
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
-from torch.func import functional_call, grad, jacrev, vmap
+from torch.func import vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
@@ -112,13 +110,6 @@ def test_gradient_agrees_with_finite_differences(name, seed):
     central = (along(step) - along(-step)) / (2 * step)
     assert_close((gradient * direction).sum(), central, rtol=1e-5, atol=1e-5)
     assert central.abs() > 1e-2
-
-
-def test_gradcheck_of_every_operand():
-    kinds = ("inside", "at_lower", "at_upper", "below", "above")
-    known = known_qp(1, n_z=6, n_c=1, n_f=2, soft=kinds, hard=())
-    operands = operands_of(known, differentiable=True)
-    assert torch.autograd.gradcheck(value, operands, eps=1e-5, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("of_action", [False, True])
@@ -242,15 +233,6 @@ def test_gradients_are_batched_as_torch_autograd_grad_does(value_of):
         assert_close(row, torch.autograd.grad(value, s, weight, retain_graph=True)[0])
 
 
-def test_the_value_alone_in_forward_mode():
-    mpc, s, tangent = random_mpc(6), random_states(5), random_states(5, seed=1)
-    with forward_ad.dual_level():
-        value = mpc.value(forward_ad.make_dual(s, tangent))
-        derivative = forward_ad.unpack_dual(value).tangent
-    step = 1e-6 * tangent
-    assert_close(derivative, (mpc.value(s + step) - mpc.value(s - step)).detach() / 2e-6)
-
-
 def test_a_value_that_is_let_go_is_freed_at_once():
     mpc, s = random_mpc(6), random_states(5)
     gc.collect()
@@ -327,21 +309,6 @@ def test_an_unsolved_element_carries_infinite_cost_and_its_fixed_entries():
 # torch.func and torch.compile
 
 
-def test_vmap_over_states_equals_the_batch():
-    mpc, s, a = random_mpc(1), random_states(5), random_states(5, 1, size=0.4)
-    assert_close(vmap(mpc.value)(s), mpc.value(s))
-    assert_close(vmap(mpc.action_value)(s, a), mpc.action_value(s, a))
-    assert_close(vmap(mpc.action_value, in_dims=(None, 0))(s[0], a), mpc.action_value(s[:1], a))
-    assert_close(vmap(mpc.value, in_dims=1)(s.mT), mpc.value(s))
-    assert_close(vmap(mpc.policy)(s), mpc.policy(s))
-
-
-def test_nested_vmap_makes_a_grid():
-    mpc, s, a = random_mpc(1), random_states(3), random_states(4, 1, size=0.4)
-    grid = vmap(lambda s: vmap(lambda a: mpc.action_value(s, a))(a))(s)
-    assert_close(grid, mpc.action_value(s.unsqueeze(1), a))
-
-
 @pytest.mark.parametrize("name", OPERANDS)
 def test_vmap_over_one_operand_equals_a_loop(name):
     known = known_qp(8, batch=(2,), soft=("inside", "above", "at_lower"), hard=())
@@ -355,37 +322,6 @@ def test_vmap_over_one_operand_equals_a_loop(name):
 
     expected = torch.stack([of_one(scale * operands[index]) for scale in scales])
     assert_close(vmap(of_one, in_dims=-1)(stack), expected)
-
-
-def test_per_sample_gradients_equal_a_loop():
-    mpc, s, a = random_mpc(2), random_states(4), random_states(4, 1, size=0.4)
-    parameters = {name: part.detach() for name, part in mpc.named_parameters()}
-
-    def of_one(parameters: dict[str, Tensor], s: Tensor, a: Tensor) -> Tensor:
-        return functional_call(mpc, parameters, (s, a))
-
-    together = vmap(grad(of_one), in_dims=(None, 0, 0))(parameters, s, a)
-    jacobian = jacrev(of_one)(parameters, s, a)
-    for i in range(len(s)):
-        mpc.zero_grad()
-        mpc.action_value(s[i], a[i]).backward()
-        alone = grad(of_one)(parameters, s[i], a[i])
-        for name, parameter in mpc.named_parameters():
-            assert parameter.grad is not None
-            for other in (together[name][i], jacobian[name][i], alone[name]):
-                assert_close(other, parameter.grad)
-
-
-def test_ensembles_of_parameters_are_vmapped():
-    modules, s = [random_mpc(seed) for seed in range(3)], random_states(4)
-    states = [dict(mpc.named_parameters()) for mpc in modules]
-    parameters = {name: torch.stack([state[name] for state in states]) for name in states[0]}
-
-    def of_one(parameters: dict[str, Tensor]) -> Tensor:
-        return functional_call(modules[0], parameters, (s,))
-
-    ensemble = vmap(of_one)(parameters)
-    assert_close(ensemble, torch.stack([mpc.value(s) for mpc in modules]))
 
 
 def test_the_operator_keeps_torchs_contract():
@@ -481,6 +417,8 @@ GOOD, OTHER = known_qp(14, batch=(3,)), known_qp(14)
     ({"fixed": torch.tensor(1.0)}, r"fixed: got shape \(\), expected shape \(\*batch, n_f\)"),
     ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
     ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
+    ({"solver": None}, "solver: got None, expected a name"),
+    ({"on_failure": None}, "on_failure: got None, expected a name"),
     ({"solver": "prox"}, r"solver: got 'prox', expected one of .* Did you mean 'proxqp'\?"),
     ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
 )
@@ -529,33 +467,7 @@ def test_invalid_data_alone_is_bad_input():
         value(*operands)
 
 
-def test_masked_failures_are_silent(recwarn):
-    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
-    assert value(*operands_of(known), on_failure="mask").isinf().tolist() == [False, True, False]
-    assert not recwarn
-
-
 # Threads and processes
-
-
-def test_concurrent_solves_get_their_own_solutions(solver):
-    problems = [known_qp(seed, batch=(3,)) for seed in range(8)]
-
-    def solve(known: KnownQP) -> QPSolution:
-        return solve_qp(known.qp, known.fixed, solver=solver)
-
-    alone = [solve(known) for known in problems]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(solve, problems))
-    for one, other in zip(alone, together, strict=True):
-        for name in SOLUTION:
-            assert_close(getattr(other, name), getattr(one, name), rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["solver", "on_failure"])
-def test_a_choice_that_is_no_name_is_refused(name):
-    with pytest.raises(QPError, match=f"{name}: got None, expected a name"):
-        solution(*operands_of(known_qp(0)), **{name: None})
 
 
 ALLOCATIONS = [

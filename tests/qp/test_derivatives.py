@@ -145,20 +145,6 @@ def test_a_fully_fixed_z_moves_with_the_fixed_entries():
     assert_close(slope, torch.ones_like(fixed))
 
 
-def test_the_values_second_derivative_agrees_with_differences_of_its_first():
-    mpc, s = random_mpc(1), random_states(6)
-
-    def gradient(x: Tensor) -> Tensor:
-        x = x.detach().requires_grad_()
-        return torch.autograd.grad(mpc.value(x).sum(), x)[0]
-
-    second = vmap(jacrev(jacrev(mpc.value)))(s)
-    step = 1e-5
-    for i, axis in enumerate(torch.eye(s.shape[-1], dtype=s.dtype)):
-        central = (gradient(s + step * axis) - gradient(s - step * axis)) / (2 * step)
-        assert_close(second[..., i], central, rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", [name for name in OPERANDS if name != "c"])
 def test_second_derivative_of_the_value_in_every_operand(name):
     known = known_qp(7, soft=KINDS, hard=("inside", "at_upper"))

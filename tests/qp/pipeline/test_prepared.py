@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from torch.func import functional_call
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
@@ -64,13 +63,3 @@ def test_an_update_in_place_and_back_is_followed():
     assert_close(twin.value(s), before, rtol=0, atol=0)
     mpc.C.data.copy_(C)  # unseen by version counters
     assert_close(mpc.value(s), before, rtol=0, atol=0)
-
-
-def test_the_answer_follows_the_parameters_of_a_functional_call():
-    mpc, other, s = random_mpc(43), random_mpc(44), random_states(4)
-    parameters = {name: part.detach() for name, part in other.named_parameters()}
-    own = mpc.value(s)
-    called = functional_call(mpc, parameters, (s,))
-    assert_close(called, other.value(s), rtol=0, atol=0)
-    assert (called - own).abs().min() > 1e-6
-    assert_close(mpc.value(s), own, rtol=0, atol=0)

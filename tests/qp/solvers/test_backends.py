@@ -172,14 +172,6 @@ def test_a_warm_start_leads_to_the_same_answer(solver, size):
     assert_close(warm.xi, cold.xi, rtol=1e-4, atol=1e-4)
 
 
-def test_a_warm_start_from_an_unrelated_solution_does_no_harm(solver):
-    known, unrelated = known_qp(10, batch=(6,)), known_qp(11, batch=(6,))
-    start = solve_qp(unrelated.qp, unrelated.fixed, solver=solver)
-    solution = solve_qp(known.qp, known.fixed, solver=solver, warm_start=start)
-    assert_close(solution.value, known.value)
-    assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
-
-
 def test_a_warm_start_from_an_unsolved_element_does_no_harm(solver):
     known = known_qp(12, batch=(3,))
     invalid = replace(known.qp, q=torch.nan * known.qp.q, check_values=False)
