@@ -133,13 +133,7 @@ def random_qp(seed: int) -> Any:
     theta = (H, rng.standard_normal(n_z), rng.standard_normal(), C, b, G, lb, ub, w)
     tensors = (torch.as_tensor(x, dtype=torch.float64) for x in theta)
     qp = QuadraticProgram(*tensors, check_values=False)
-    parts = {
-        "n_p": n_p,
-        "n_u": n_u,
-        "constants": {},
-        "sequential": None,
-        "levels": None,
-    }
+    parts = {"n_p": n_p, "n_u": n_u, "constants": {}, "sequential": None, "levels": None}
     return SimpleNamespace(quadratic_program=lambda: qp, **parts)
 
 

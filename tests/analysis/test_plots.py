@@ -11,11 +11,7 @@ from tests.figures import image_of, legend_of, make_mpc, rendered
 from tests.problems import drawn_mpc, normal
 from tests.refused import refused
 from torch_qpmpc import QPError
-from torch_qpmpc.analysis.plots import (
-    canonical_figure,
-    episode_figure,
-    plans_along,
-)
+from torch_qpmpc.analysis.plots import canonical_figure, episode_figure, plans_along
 from torch_qpmpc.analysis.structure import nearest_model, predictions
 
 pytestmark = pytest.mark.layout

@@ -27,10 +27,7 @@ from torch_qpmpc.export.library import required_compiler
 from torch_qpmpc.study.markdown import write_section
 
 HERE = Path(__file__).parent
-CHOSEN = (
-    "point mass, N = 10",
-    "12 states, 4 actions, N = 10",
-)
+CHOSEN = ("point mass, N = 10", "12 states, 4 actions, N = 10")
 PASSES, COLD = 5, 1000
 #: Steps of the contender in Python.
 FEW = 200

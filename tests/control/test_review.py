@@ -95,10 +95,7 @@ MISTAKES = {
     ),
     "a filter that trusts all": (
         (INTEGRATOR, fast(noise=0.1, drift=1.0)),
-        (
-            "margin",
-            r"Slow the filter down, as by .*, noise={'y1': (1)}\), or raise dR tenfold\.",
-        ),
+        ("margin", r"Slow the filter down, as by .*, noise={'y1': (1)}\), or raise dR tenfold\."),
         lambda noise: fast(noise={"y1": float(noise)}, drift=1.0),
     ),
     "inputs that set-points leave free, without a weight": (

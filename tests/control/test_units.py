@@ -23,11 +23,7 @@ def two_by_two(y, u, **options):
 
 
 @pytest.mark.parametrize(
-    ("y", "u", "bounded"),
-    [
-        ((1e5, 1e-2), (1e5, 1e-5), True),
-        ((1e-6, 1e4), (1e5, 1e-5), False),
-    ],
+    ("y", "u", "bounded"), [((1e5, 1e-2), (1e5, 1e-5), True), ((1e-6, 1e4), (1e5, 1e-5), False)]
 )
 def test_a_set_point_in_any_unit_is_tracked_and_the_design_is_sound(y, u, bounded, tmp_path):
     options = {} if bounded else {"y_bounds": None}

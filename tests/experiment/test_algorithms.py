@@ -8,12 +8,7 @@ import torch
 from tests.runs import SMALL, choices, linear_system, make_config
 from torch_qpmpc import QPActorValueOperator
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
-from torch_qpmpc.experiment.algorithms import (
-    evaluate,
-    make_learner,
-    make_optimizer,
-    make_penalties,
-)
+from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_optimizer, make_penalties
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
 

@@ -57,8 +57,7 @@ def test_a_live_process_holds_the_lock_and_a_killed_one_does_not(tmp_path):
 )
 def test_an_error_of_the_user_is_one_sentence(tmp_path, monkeypatch, error, sentence):
     hydra: Any = SimpleNamespace(
-        mode=RunMode.RUN,
-        runtime=SimpleNamespace(output_dir=str(tmp_path)),
+        mode=RunMode.RUN, runtime=SimpleNamespace(output_dir=str(tmp_path))
     )
     monkeypatch.setattr(HydraConfig, "get", lambda: hydra)
     captured: list[bool] = []

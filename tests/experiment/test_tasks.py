@@ -183,10 +183,7 @@ def test_a_scheme_passes_what_is_known_and_more(store_task):
     scheme = find_task(cfg.task).wrong_scheme(cfg, plant)
     for cost, message in (
         (dataclasses.replace(scheme.cost, c=7.0), None),
-        (
-            Cost(hessian="block"),
-            r"task\.name: got 'store', whose scheme has no model or no stage ",
-        ),
+        (Cost(hessian="block"), r"task\.name: got 'store', whose scheme has no model or no stage "),
     ):
         changed = dataclasses.replace(scheme, cost=cost)
         task = dataclasses.replace(TASKS["store"], wrong_scheme=lambda *_, x=changed: x)

@@ -161,10 +161,7 @@ def test_units_change_no_estimate(order):
     data, size_y, size_u = noisy(10, 50), np.array([1e6, 1e-6]), np.array([1e-6, 1e4])
     shift = np.array([3e6, -2e-6])
     scaled = [trajectory(y * size_y + shift, u * size_u, d) for y, u, d in map(tuple, arrays(data))]
-    one, other = (
-        fit_state_space(data, order, 5).model,
-        fit_state_space(scaled, order, 5).model,
-    )
+    one, other = (fit_state_space(data, order, 5).model, fit_state_space(scaled, order, 5).model)
     for (y, u, d), (ys, us, ds) in zip(arrays(data), arrays(scaled), strict=True):
         xi = one.estimates(y, u, d)[:, :2]
         np.testing.assert_allclose(

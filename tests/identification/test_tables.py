@@ -201,8 +201,7 @@ def test_gaps_marks_and_missing_inputs_end_trajectories_and_missing_outputs_stay
     assert log.trajectories[1].y.isnan().flatten().nonzero().flatten().tolist() == [10]
     assert log.notes[1:] == ("T is no number in 1 row, as in 'n/a'",)
     assert_close(
-        log.trajectories[1].y[:10, 0],
-        torch.as_tensor(np.array(frame["T"][10:20], dtype=float)),
+        log.trajectories[1].y[:10, 0], torch.as_tensor(np.array(frame["T"][10:20], dtype=float))
     )
 
 
@@ -254,11 +253,7 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
         for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
     ),
     *(
-        (
-            room().assign(t=t),
-            {"time": "t"},
-            f"time: got t with '{t}', expected numbers or dates",
-        )
+        (room().assign(t=t), {"time": "t"}, f"time: got t with '{t}', expected numbers or dates")
         for t in ("noon", "12:xx")
     ),
     *(

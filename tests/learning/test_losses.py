@@ -8,14 +8,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import CQLLoss
 
-from tests.losses import (
-    LOSSES,
-    critic,
-    make_batch,
-    make_loss,
-    network_gaussian,
-    total,
-)
+from tests.losses import LOSSES, critic, make_batch, make_loss, network_gaussian, total
 from torch_qpmpc import SolverError
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")

@@ -5,10 +5,9 @@ import io
 import pytest
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
 
 from tests import store
+from tests.rollouts import Staggered, collected
 from torch_qpmpc.envs import PointMass, PointMassEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.replay import Replay, walk, windows_to_tau
@@ -16,31 +15,14 @@ from torch_qpmpc.learning.replay import Replay, walk, windows_to_tau
 ENVS, N = 8, 4
 
 
-class StaggeredEnv(PointMassEnv):
+class StaggeredEnv(Staggered, PointMassEnv):
     """A plant whose episodes start, and therefore end, at different steps."""
-
-    def _reset(self, tensordict=None, **kwargs):
-        out = super()._reset(tensordict, **kwargs)
-        if tensordict is None or "_reset" not in tensordict:
-            out["step_count"] = torch.arange(self.batch_size[0]).unsqueeze(-1) % self.max_steps
-        return out
 
 
 def batches(count: int, steps: int, max_steps: int) -> list[TensorDictBase]:
     """Noiseless ``(ENVS, steps)`` batches, so that the physics can be checked."""
-    torch.manual_seed(0)
     env = StaggeredEnv(ENVS, PointMass(noise_std=0.0), max_steps=max_steps, seed=0)
-    net = torch.nn.Sequential(torch.nn.Linear(4, 2), torch.nn.Tanh())
-    collector = Collector(
-        env,
-        TensorDictModule(net, in_keys=["observation"], out_keys=["action"]),
-        frames_per_batch=steps * ENVS,
-        total_frames=count * steps * ENVS,
-        auto_register_policy_transforms=False,
-    )
-    data = [batch.clone() for batch in collector]
-    collector.shutdown()
-    return data
+    return [*collected(env, count, steps).split(steps, dim=1)]
 
 
 def filled(data: list[TensorDictBase], rows: int, num_windows: int = 400, seed: int = 0) -> Replay:

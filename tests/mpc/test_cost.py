@@ -19,9 +19,7 @@ def test_q_and_c_are_without_discounts():
     assert mpc.c == 3
 
 
-@refused(
-    ({"stage_weight": [1.0, torch.inf, 0.0]}, "stage_weight: got NaN or inf"),
-)
+@refused(({"stage_weight": [1.0, torch.inf, 0.0]}, "stage_weight: got NaN or inf"))
 def test_bad_arguments_are_named(arguments):
     Cost(**arguments)
 

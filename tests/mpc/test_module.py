@@ -53,15 +53,7 @@ from tests.problems import (
     step,
 )
 from tests.refused import refused
-from torch_qpmpc import (
-    QPMPC,
-    GaussNewton,
-    QPError,
-    QuadraticProgram,
-    SolverError,
-    Status,
-    solve_qp,
-)
+from torch_qpmpc import QPMPC, GaussNewton, QPError, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.mpc.riccati import riccati_weight
 from torch_qpmpc.qp.solution import QPSolution
 

@@ -123,11 +123,7 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
     ("file", "content", "wrong"),
     [
         ("config.yaml", b"[]\n", r"config.yaml: got .* \(it is a list\), expected the config"),
-        (
-            "config.yaml",
-            b"seed: 1\nsolver: daqp\n",
-            r"config.yaml: got .* \(eval_seed: got noth",
-        ),
+        ("config.yaml", b"seed: 1\nsolver: daqp\n", r"config.yaml: got .* \(eval_seed: got noth"),
         ("config.yaml", b"seed: \xff\n", r"config.yaml: got .* \('utf-8' codec can't decode"),
         ("config.yaml", None, r"config.yaml: got .* \(.*No such file"),
         ("summary.json", b"junk", r"summary.json: got .* \(Expecting value"),
