@@ -11,7 +11,8 @@ from torch.testing import assert_close
 
 from tests.gauss_newton import Reference, penalty
 from tests.problems import MIXED, normal, random_mpc, random_states
-from torch_qpmpc import QPMPC, GaussNewton, QPError, SystemIdentificationPenalty
+from tests.refused import refused
+from torch_qpmpc import QPMPC, GaussNewton, SystemIdentificationPenalty
 from torch_qpmpc.learning.gauss_newton import FALL, FIRST, RISE
 from torch_qpmpc.learning.td_error import inverse_variance
 from torch_qpmpc.qp.pipeline.solve import SolveLog
@@ -227,33 +228,15 @@ def test_a_warm_start_saves_time_only():
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("lr", 0.0, r"a number in \(0, 1\]"),
-        ("lr", 1.1, r"a number in \(0, 1\]"),
-        ("damping", -1.0, "a finite number > 0"),
-    ],
+@refused(
+    ({"lr": 0.0}, {}, r"lr: got 0.0, expected a number in \(0, 1\]"),
+    ({"lr": 1.1}, {}, r"lr: got 1.1, expected a number in \(0, 1\]"),
+    ({"damping": -1.0}, {}, "damping: got -1.0, expected a finite number > 0"),
+    ({"scales": {"A": 1.0}}, {}, r"rates: got \['A'\], expected names among"),
+    ({}, {"clip": math.inf}, "clip: got inf, expected a finite number > 0"),
 )
-def test_numbers_out_of_range_are_named(name, value, expected):
-    with pytest.raises(QPError, match=f"{name}: got {value}, expected {expected}"):
-        GaussNewton(random_mpc(), **{name: value})
-
-
-def test_a_clip_out_of_range_is_named():
-    with pytest.raises(QPError, match="clip: got inf, expected a finite number > 0"):
-        GaussNewton(mpc := random_mpc(2)).step(*pairs(), targets(mpc), clip=math.inf)
-
-
-def test_unknown_scales_are_named():
-    with pytest.raises(QPError, match=r"rates: got \['A'\], expected names among"):
-        GaussNewton(random_mpc(), scales={"A": 1.0})
-
-
-def test_a_penalty_needs_a_free_C():
-    mpc = random_mpc(learn=("H", "c"))
-    with pytest.raises(QPError, match="penalty: got a C that is tied, masked or frozen, exp"):
-        GaussNewton(mpc).step(*pairs(), targets(mpc), penalty=torch.eye(mpc.n_z + 1).double())
+def test_numbers_out_of_range_are_named(options, of_step):
+    GaussNewton(mpc := random_mpc(2), **options).step(*pairs(), targets(mpc), **of_step)
 
 
 @pytest.mark.parametrize("trust_region", [True, False])

@@ -6,7 +6,6 @@ import pickle
 import pytest
 import torch
 from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.func import vmap
 from torch.nn.utils import parametrize
 from torch.testing import assert_close
@@ -52,14 +51,6 @@ def test_meta_tensors_have_the_shapes_and_dtypes(kind):
     meta = outcome(mpc.to("meta"), s.to("meta"), A.to("meta"))
     assert all(x.is_meta for x in meta)
     assert [(x.shape, x.dtype) for x in meta] == [(x.shape, x.dtype) for x in real]
-
-
-def test_fake_tensors_have_the_shapes():
-    mpc = random_mpc(0)
-    with FakeTensorMode(allow_non_fake_inputs=True):
-        s, a = torch.zeros(5, 2), torch.zeros(5, 1)
-        assert mpc.value(s).shape == mpc.action_value(s, a).shape == (5,)
-        assert mpc.policy(s).shape == (5, 1)
 
 
 @kinds

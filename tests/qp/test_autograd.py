@@ -123,24 +123,6 @@ def test_gradient_in_state_and_action_agrees_with_finite_differences(of_action):
         assert torch.autograd.gradcheck(mpc.value, (s,), eps=1e-5, atol=1e-4)
 
 
-def test_gradient_of_a_shared_tensor_is_the_sum_over_the_batch():
-    known = known_qp(2, batch=(5,))
-    shared = operands_of(known, differentiable=True)
-    separate = operands_of(known_qp(2, batch=(5,)), differentiable=False)
-    for i, name in enumerate(OPERANDS):
-        if name in ("H", "C", "G"):
-            separate[i] = separate[i].expand(5, -1, -1).clone()
-        separate[i].requires_grad_()
-    weight = torch.arange(1, 6).double()
-    value(*shared).backward(weight)
-    value(*separate).backward(weight)
-    for name, one, many in zip(OPERANDS, shared, separate, strict=True):
-        assert one.grad is not None
-        assert many.grad is not None
-        expected = many.grad.sum(0) if name in ("H", "C", "G") else many.grad
-        assert_close(one.grad, expected)
-
-
 def test_batch_dimensions_broadcast_in_value_and_gradient():
     K, B = 3, 4
     shapes = {"H": (K, 1), "q": (B,), "c": (K, 1), "C": (1, B), "b": (), "G": (), "w": (K, 1)}
@@ -267,15 +249,6 @@ def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming):
         assert operand.grad.isfinite().all(), name
         assert (operand.grad[1] == 0).all(), name
     assert (operands[0].grad[0] != 0).any()  # pyright: ignore[reportOptionalSubscript] - seen above
-
-
-def test_an_unsolved_element_adds_nothing_to_a_shared_tensors_gradient():
-    known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
-    shared = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    operands = operands_of(known)
-    value(*(operand + shared for operand in operands), on_failure="mask").square().sum().backward()
-    assert shared.grad is not None
-    assert shared.grad.isfinite()
 
 
 def test_invalid_elements_have_no_gradient_and_spoil_no_other():
