@@ -130,7 +130,9 @@ def test_they_are_saved_explained_and_paid_for(tmp_path):
     loaded, text = qm.Controller.load(tmp_path / "c.qpmpc"), str(controller.explain())
     assert np.abs(loaded.step([0.9, 0.0]) - controller.step([0.9, 0.0])).max() < 1e-12
     assert "mixed is at its upper bound 0.6 in steps" in text
-    assert "end is at its upper bound 0.5 in steps 8 to 8" in text
+    assert "end is at its upper bound 0.5 in step 8" in text
+    hard = made(8, terminal_constraints={"end": (*ENDS["end"][:2], np.inf)})
+    assert hard.review(r=[0.3, 0.0])["hard bounds"].remedy == "Give end a finite price."
     run = controller.simulate(steps=20, r=[3.0, 0.0], load=[0.3, 0.0])
     plain = made(8, y_bounds={"p": (-1.5, 1.5)}, du_bounds=(-0.8, 0.8)).mpc.design
     over = np.maximum(run.y[:-1, 0] - 0.5 * run.u[:, 1] - 0.6, 0)
@@ -158,7 +160,7 @@ def test_they_are_saved_explained_and_paid_for(tmp_path):
         ),
         (
             {"a": ({"T": 1.0}, (1, 0))},
-            "constraints: got lower 1 > upper 0 for a, expected lower <=",
+            "constraints: got (1, 0) for a, expected lower <=",
         ),
         (
             {"a": ({"T": 1.0}, (0, 1), -1.0)},

@@ -76,10 +76,21 @@ def test_an_operator_reads_names_units_and_what_to_do():
     )
     assert "\nq is at its upper bound " in text
     assert " kW in steps " in text
-    assert "one kW more would save " in text
+    assert "1 kW more would save " in text
     assert "\ndisturbance of T " in text
     assert "Set T to 4.5, not 8, or widen y_bounds of T" in text
     assert "No bound holds the plan back." in str(stepped(r=1.9, y_bounds=None).explain())
+
+
+def test_prices_of_small_signals_are_by_a_unit_of_their_size():
+    mpc = qm.LinearMPC(
+        (A, 1e6 * B), 8, Q=[1.0, 0.0], dR=1e10, u_bounds=(-2e-6, 2e-6), du_bounds=(-1e-6, 1e-6)
+    )
+    made = qm.Controller(mpc)
+    made.step([0.0, 0.0], [2.0, 0.0])
+    (limit,) = (x for x in made.explain().limits if x.signal == "move of u1")
+    saved = f"1e-06 more would save {1e-6 * limit.price:.3g} of the cost."
+    assert limit.text == f"move of u1 is at its upper bound 1e-06 in step 0: {saved}"
 
 
 def test_a_violated_soft_bound_is_told_by_how_much():

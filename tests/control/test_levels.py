@@ -49,6 +49,24 @@ def closed_loop(controller: qm.Controller, steps: int, manual=()) -> np.ndarray:
     return np.array(applied)
 
 
+@pytest.mark.parametrize("levels", [{}, {"u_levels": {"u1": (0.0, 1.0)}}])
+@pytest.mark.parametrize("seed", [6, 20, 21])
+def test_zones_need_no_weight_of_outputs(seed, levels):
+    """The cost to go of the state is zero, of which rounding leaves 1e-30 of any sign."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 5))
+    A = rng.normal(size=(n, n))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+    weights = {"R": [1e-4, 0.01], "dR": [0.0, 0.05], "y_slack": 20.0}
+    bounds = {"y_bounds": (-0.5, 0.5), "u_bounds": (0.0, 1.0)}
+    mpc = qm.LinearMPC((A, rng.normal(size=(n, 2))), 8, **weights, **bounds, **levels)
+    controller = qm.Controller(mpc)
+    controller.reset(u=[0.0, 0.5])
+    for _ in range(3):
+        controller.step(0.7 * rng.normal(size=n))
+        assert controller.status.name == "SOLVED"
+
+
 def test_minimum_times_count_what_was_applied_with_missing_outputs_and_manual_mode():
     u = closed_loop(qm.Controller(of()), 60)
     assert set(u) <= {*LEVELS}

@@ -40,6 +40,18 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     assert twin.mpc.design.plant.dt == 0.5
 
 
+def test_a_redesigned_controller_keeps_its_observer_in_a_file(tmp_path):
+    """The filter of a new controller would be that of the new bounds."""
+    controller = qm.Controller(qm.LinearMPC((A, B, C), 4, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0)))
+    controller.redesign(u_bounds=(-9.0, 9.0), Q=4.0)
+    controller.save(tmp_path / "mine")
+    twin = qm.Controller.load(tmp_path / "mine")
+    assert np.array_equal(twin.observer.L, controller.observer.L)
+    assert not np.allclose(qm.Controller(twin.mpc).observer.L, twin.observer.L)
+    steps = np.random.default_rng(0).normal(size=(9, 1))
+    assert [twin.step(y, [0.5]) for y in steps] == [controller.step(y, [0.5]) for y in steps]
+
+
 def test_a_controller_is_saved_before_its_first_step_and_without_disturbances(tmp_path):
     controller = qm.Controller(qm.LinearMPC((A, B, C), 5, Q=1.0, R=1.0, disturbances=None))
     controller.save(tmp_path / "mine")

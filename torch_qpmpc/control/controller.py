@@ -16,19 +16,20 @@ from torch_qpmpc.control.explain import Explanation, explain
 from torch_qpmpc.control.exporting import ControllerExport, export_controller, export_controller_fmu
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.learning import LearningReport, improve, learn
-from torch_qpmpc.control.linear_mpc import LinearMPC, check_theta, packed, unpacked
+from torch_qpmpc.control.linear_mpc import LinearMPC, packed, restored, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, ready, simulate
 from torch_qpmpc.control.state_space import Array, read_measured, read_table
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.files import load_file, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
 
 #: The kind of file that `Controller.save` writes.
 KIND = "Controller"
-#: The options of a controller that a file holds.
-OPTIONS = ("noise", "drift", "gain")
+#: The arguments of a controller besides its MPC, and the parts of its law that a file holds.
+SETTINGS = ("noise", "drift", "gain")
+PARTS = (*SETTINGS, "observer", "max_plausible")
 
 
 class Controller:
@@ -235,8 +236,8 @@ class Controller:
             QPError: a part of theta has a parametrization that is not QPMPC's own.
             OSError: writing failed; the old file is unchanged.
         """
-        options = {name: getattr(self._law, name) for name in OPTIONS}
-        state = packed(options | self._memory._asdict())
+        parts = {name: getattr(self._law, name) for name in PARTS}
+        state = packed(parts | self._memory._asdict())
         save_file(path, KIND, {**self.mpc.stored(), "controller": state})
 
     @classmethod
@@ -247,15 +248,18 @@ class Controller:
             QPError: the file is missing or damaged, of another kind or a newer release, has theta
                 of another cost, or holds more than tensors and plain values.
         """
-        content = load_file(path, KIND)
-        check_theta(path, content)
-        try:
-            state = unpacked(content["controller"])
-            options = {name: state.pop(name) for name in OPTIONS if name in state}
-            controller = cls(LinearMPC.of_stored(content), **options)
-            controller._memory = Memory(**state)
-        except Exception as error:  # damaged files raise errors of any type
-            raise damaged(Path(path), error, "a file that Controller.save wrote") from error
+        return restored(path, load_file(path, KIND), cls._of_stored)
+
+    @classmethod
+    def _of_stored(cls, content: Mapping[str, Any]) -> Controller:
+        state = unpacked(content["controller"])
+        parts = {name: state.pop(name) for name in PARTS if name in state}
+        mpc, settings = LinearMPC.of_stored(content), (parts.get(x) for x in SETTINGS)
+        if "observer" in parts:  # else a file of an earlier release
+            parts["observer"] = Observer(**parts["observer"])
+        controller = cls.__new__(cls)
+        controller._law = ready(replace(Law.of(mpc, *settings), **parts))
+        controller._start(Memory(**state))
         return controller
 
     def simulate(self, plant: Any = None, steps: int = 200, r: Any = None, **options: Any) -> Run:

@@ -325,12 +325,10 @@ class Design:
         """Places of the known signals that bound outputs and inputs, ``(2, n)``, -1 without one."""
         place = {name: i for i, name in enumerate(self.plant.known)}
         of_y, of_u = (
-            np.array(
-                [[place.get(x, -1) for x in self.limits.get(name, ("", ""))] for name in names]
-            )
+            [[place.get(x, -1) for x in self.limits.get(name, ("", ""))] for name in names]
             for names in (self.plant.outputs, self.plant.inputs)
         )
-        return of_y.T, of_u.T
+        return np.array(of_y).T, np.array(of_u).T
 
     @cached_property
     def nominal(self) -> Array:
@@ -521,9 +519,8 @@ class Design:
 
     def selectors(self) -> dict[str, Array]:
         """Return the rows that read each signal from a stage [d_k; x_k; u_k]."""
-        places = self.places
-        unit = np.eye(places["u"].stop)
-        return {name: unit[place] for name, place in places.items()}
+        unit = np.eye(self.places["u"].stop)
+        return {name: unit[place] for name, place in self.places.items()}
 
 
 def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[str, Any]:
@@ -537,7 +534,7 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
     y, u = plant.outputs, plant.inputs
     readers: dict[str, Any] = {"Q": (read_weight, y), "R": (read_weight, u), "dR": (read_weight, u)}
     readers |= {"y_bounds": (read_bounds, y), "u_bounds": (read_bounds, u)}
-    readers |= {"du_bounds": (read_moves, u), "y_slack": (read_said, y)}
+    readers |= {"du_bounds": (read_bounds, u), "y_slack": (read_said, y)}
     readers |= {"u_target": (read_said, u), "violation": (read_said, y)}
     readers["constraints"] = read_constraints, (*y, *u)
     readers["terminal_constraints"] = read_constraints, y
@@ -708,18 +705,8 @@ def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
     return {key: x for key, x in pairs if not np.isnan(x)}
 
 
-def read_moves(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
-    """Read bounds of moves, which must allow to hold an input."""
-    lower, upper = read_bounds(name, value, names)
-    for key, *pair in zip(names, lower, upper, strict=True):
-        if not pair[0] <= 0 <= pair[1]:
-            got, want = f"({pair[0]:g}, {pair[1]:g}) for {key}", "bounds with zero between them"
-            raise QPError.expected(name, got, want, "An input must be able to stay.")
-    return lower, upper
-
-
 def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
-    """Read bounds as a mapping from names to pairs, or as one pair of numbers or vectors."""
+    """Read bounds by name, or as one pair of numbers or vectors; those of moves contain zero."""
     if value is None:
         value = {}
     if isinstance(value, Mapping):
@@ -737,8 +724,9 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
         side = [end if x is None else x for x in (side if many else [side])]
         sides.append(read_vector(f"{name}, side {i}", side if many else side[0], names, 0.0))
     lower, upper = sides
-    if (lower > upper).any():
-        i = int(np.flatnonzero(lower > upper)[0])
-        got = f"lower {lower[i]:g} > upper {upper[i]:g} for {names[i]}"
-        raise QPError.expected(name, got, "lower <= upper", "The pair is (lower, upper).")
+    moves = name == "du_bounds"
+    ordered = (lower <= 0) & (upper >= 0) if moves else lower <= upper
+    for i in np.flatnonzero(~ordered):
+        got, want = f"({lower[i]:g}, {upper[i]:g}) for {names[i]}", "lower <= upper in each pair"
+        raise QPError.expected(name, got, "zero between the bounds" if moves else want)
     return lower, upper

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: A multiplier this small, relative to a typical stage's cost for a usual deviation, is rounding.
 ACTIVE = 1e-6
+#: A smaller signal's bounds have prices in less than its unit; the first inputs of the text.
+SMALL, NEXT = 0.1, 4
 
 
 class Limit(NamedTuple):
@@ -63,10 +65,9 @@ class Explanation:
         for i, name in enumerate(plant.inputs):
             held = "at rest" if self.design.R[i].any() else "no R holds it"
             rests = f", free: {held} near {self.design.resting[i]:.4g}" * bool(self.design.free[i])
-            shown = np.unique(np.linspace(0, len(self.u) - 1, 6).astype(int))[1:]
-            later = ", ".join(f"{self.u[k, i]:.4g}" for k in shown)
-            later = f"{', then ' * bool(later)}{later}"
-            lines.append(f"{plant.quantity(name, self.u[0, i])}{later}{rests}")
+            later = "".join(f", then {x:.4g}" for x in self.u[1:NEXT, i])
+            last = f", in {len(self.u) - 1} steps {self.u[-1, i]:.4g}" * (len(self.u) > NEXT)
+            lines.append(f"{plant.quantity(name, self.u[0, i])}{later}{last}{rests}")
             levels = self.design.levels.get(name, ())
             decided = self.u[: self.design.switching.get("integer_horizon"), i]
             changed = np.flatnonzero(np.abs(np.diff(decided)) > ACTIVE * self.design.scaling.u[i])
@@ -135,9 +136,12 @@ def _limits(design: Design, lam: Array, y: Array, u: Array, known: Array) -> tup
             over, saved = over * bool(over > ACTIVE * size), abs(price[steps]).sum()
             unit = plant.units.get(name.removeprefix("move of "), "")
             text = f"{name} is at its {side} bound {bound[steps[0]]:.4g} {unit}".rstrip()
-            text += f" in steps {steps[0]} to {steps[-1]}"
+            runs = np.split(steps, 1 + np.flatnonzero(np.diff(steps) > 1))
+            spans = ", ".join(f"{x[0]} to {x[-1]}" if len(x) > 1 else f"{x[0]}" for x in runs)
+            text += f" in step{'s' * (len(steps) > 1)} {spans}"
             text += f", violated by up to {over:.3g}" * bool(over)
-            more = f"{unit or 'unit'} {'more' if sign > 0 else 'less'}"
-            text += f": one {more} would save {saved:.3g} of the cost."
+            one = 10.0 ** np.floor(np.log10(size)) if size < SMALL else 1.0
+            more = f"{one:g} {unit} {'more' if sign > 0 else 'less'}".replace("  ", " ")
+            text += f": {more} would save {saved * one:.3g} of the cost."
             limits.append(Limit(str(name), text, float(saved), over))
     return tuple(sorted(limits, key=lambda limit: -limit.price))

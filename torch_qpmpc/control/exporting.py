@@ -57,11 +57,11 @@ class ControllerExport:
 
     def __str__(self) -> str:
         """Return a report of a few lines."""
-        state = "" if self.state_bytes is None else f", state {self.state_bytes:,} bytes"
+        sizes = f"tables {self.table_bytes:,} bytes"
+        sizes += "" if self.state_bytes is None else f", state {self.state_bytes:,} bytes"
         compared = "not compared: no C compiler was found"
         if self.difference is not None:
             compared = f"inputs of a closed loop of {self.steps} steps within {self.difference:.1e}"
-        sizes = f"tables {self.table_bytes:,} bytes{state}"
         lines = [", ".join(map(str, self.files)), sizes, compared]
         lines += ["steps with or after missing outputs carry the covariance"] * self.missing
         return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -202,8 +202,7 @@ class LinearMPC:
         if learned := ", ".join(self.plan.learned):
             got, remedy = f"an MPC that learns {learned}", "Change the parameters of its plan."
             raise QPError.expected("mpc", got, "one whose theta is its design's", remedy)
-        wishes = read_wishes(self.design.plant, self.design, **changes)
-        design = replace(self.design, **wishes)
+        design = replace(self.design, **read_wishes(self.design.plant, self.design, **changes))
         return LinearMPC.of_design(design, **self.options)
 
     def save(self, path: str | Path) -> None:
@@ -224,11 +223,7 @@ class LinearMPC:
         if "design" not in content:
             remedy = "QPMPC.load reads it."
             raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)
-        check_theta(path, content)
-        try:
-            return cls.of_stored(content)
-        except Exception as error:  # damaged files raise errors of any type
-            raise damaged(Path(path), error, "a file that LinearMPC.save wrote") from error
+        return restored(path, content, cls.of_stored)
 
     def stored(self) -> dict[str, Any]:
         """Return the content of a file, tensors and plain values, that `of_stored` reads.
@@ -323,11 +318,15 @@ def _expanded(
     return expanded
 
 
-def check_theta(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Raise `QPError` if a file has learned theta of a plan in another format."""
+def restored(path: str | Path, content: Mapping[str, Any], of: Callable[[Any], Any]) -> Any:
+    """Return what ``of`` makes of a file's content; `QPError` if it has theta of another cost."""
     if content["version"] < VERSION and content["arguments"]["learn"]:
         got, want = f"{path}, whose plan has learned another cost", f"a file of version {VERSION}"
         raise QPError.expected("path", got, want, "Learn again: its design and log go on.")
+    try:
+        return of(content)
+    except Exception as error:  # damaged files raise errors of any type
+        raise damaged(Path(path), error, "a file that save wrote") from error
 
 
 def packed(value: Any) -> Any:

@@ -158,8 +158,10 @@ def riccati(design: Design) -> Array | None:
     radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
     eigenvalues = torch.linalg.eigvalsh(P)
     exists = radius < 1 - 1e-9 and eigenvalues[0] >= -1e-9 * eigenvalues[-1].abs()
-    sizes = np.concatenate((of_x, of_u))[: len(P)]
-    return P.numpy() / np.outer(sizes, sizes) if exists else None
+    P, sizes = P.numpy(), np.concatenate((of_x, of_u))[: len(P)]
+    costless = np.diag(P) <= TINY**1.5 * np.diag(P).max()
+    P[costless] = P[:, costless] = 0.0  # rounding would set the lengths of the QP
+    return P / np.outer(sizes, sizes) if exists else None
 
 
 def _costless(design: Design) -> bool:

@@ -104,7 +104,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     findings.append(_stability(loop, design.gamma, terminal.remedy))
     if loop.radius < 1:
         findings += [_margin(loop, law), _offset(loop, design)]
-        if design.plant.noise is not None:
+        if design.plant.noise is not None and findings[-3].ok:
             findings.append(_noise(loop, law, design.plant.noise))
     return Review(findings)
 
@@ -214,7 +214,8 @@ def hard_rows(design: Design) -> Finding:
     hard = np.isinf(rows.price) & rows.W[:, : len(design.Q)].any(1)
     names = ", ".join(dict.fromkeys(rows.names[hard]))
     text = f"There is no plan while noise or a load holds {names} outside the hard bounds."
-    remedy = f"Give {names} a finite y_slack." * bool(names)
+    price = "y_slack" if (rows.arguments[hard] == "y_bounds").all() else "price"
+    remedy = f"Give {names} a finite {price}." * bool(names)
     return Finding("hard bounds", not names, text if names else "No output has one.", remedy)
 
 

@@ -223,7 +223,7 @@ def _factor(H_v: Array) -> tuple[Array, float]:
             "H",
             f"eigenvalues from {lowest:.3g} to {highest:.3g} on the plan",
             "a cost that is positive definite on all plans that satisfy C z = b",
-            "Add a small weight of the actions, such as 1e-5, to stage_weight "
+            "Give the actions a small weight, such as 1e-5, by stage_weight or LinearMPC's R, "
             "and learn H with it: without one u_0 is not unique, and the C could not be exact.",
         )
     return np.linalg.cholesky(H_v), float(highest / lowest)

@@ -7,7 +7,8 @@ import torch
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, programs_of, random_mpc, random_states
-from torch_qpmpc.qp.pipeline.batch import LATEST, Programs
+from torch_qpmpc.qp.pipeline.batch import LATEST, Prepared, Programs, Theta
+from torch_qpmpc.qp.pipeline.scaling import Units
 
 
 def test_a_theta_that_the_batch_shares_is_prepared_once():
@@ -30,6 +31,22 @@ def test_a_change_in_place_is_another_theta_and_back_the_same(i):
     assert all(np.array_equal(x, y) for x, y in zip(one.theta, other.theta, strict=True)) is False
     theta[i].copy_(before)
     assert Programs.of(*theta, fixed)[0].prepared is one
+
+
+def test_other_bounds_are_in_the_same_units_even_if_those_are_far_from_one():
+    rng = np.random.default_rng(0)
+    H = np.diag(10.0 ** rng.uniform(-12, 12, 4))[None]
+    shapes = (1, 1, 4), (1, 2, 4)
+    C, G = (rng.normal(size=x) * 10.0 ** rng.uniform(-12, 12, x) for x in shapes)
+    lb, ub, far, q = -np.full((1, 2), 1e-3), np.ones((1, 2)), np.full((1, 1), 1e5), np.ones((1, 4))
+    theta = Theta(H, C, G, q, np.zeros(1), far, lb, ub, np.full((1, 2), np.inf))
+    prepared = Prepared(theta, np.zeros(1, np.int64), 1)
+    assert prepared.units is not None
+    assert Units.of(prepared.scaled.theta, prepared.group) is not None
+    other = prepared.bounded(2 * lb, 3 * ub)
+    assert other.units is prepared.units
+    for own, new in zip(prepared.scaled.theta[-3:-1], other.scaled.theta[-3:-1], strict=True):
+        assert np.array_equal(new, own * (2 if own.max() < 0 else 3))
 
 
 def test_only_the_latest_are_remembered():

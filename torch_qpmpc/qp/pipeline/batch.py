@@ -105,9 +105,11 @@ class Prepared:
 
     @cached_property
     def scaled(self) -> Prepared:
-        """The same theta, in its `units`."""
+        """The same theta, in its `units`: it has none of its own."""
         assert self.units is not None
-        return Prepared(self.units.scaled(self.theta), self.units.group, self.n_kept)
+        scaled = Prepared(self.units.scaled(self.theta), self.units.group, self.n_kept)
+        vars(scaled)["units"] = None
+        return scaled
 
     def condensed(self, n_f: int) -> Condensed:
         """Return the QPs without C z = b, for n_f fixed entries."""
