@@ -172,8 +172,7 @@ class Prepared:
         used, group = np.unique(group, return_inverse=True)
         matrices = (x if len(x) == 1 else x[used] for x in self.theta[:3])
         vectors = (x if len(x) == 1 else x[index] for x in self.theta[3:])
-        theta = Theta(*matrices, *vectors)
-        return group, Prepared(theta, group, self.n_kept)
+        return group, Prepared(Theta(*matrices, *vectors), group, self.n_kept)
 
     def eliminated(self, elimination: Elimination, n_f: int) -> Prepared:
         """Return the same theta with another elimination of C z = b, which keeps n_f entries."""
@@ -260,8 +259,7 @@ class Programs:
 
     def scaled(self) -> Programs:
         """Return the same QPs in their own units."""
-        units = self.prepared.units
-        if units is None:
+        if (units := self.prepared.units) is None:
             return self
         group = self.group if len(units.group) == 1 else units.group  # of a shared theta, zeros
         _, length, *_ = units.per_qp(group)
