@@ -212,7 +212,7 @@ class Levels:
         if prepared.sizes(n_f).shift.any() and (slope := np.abs(qps.g).max(initial=0.0)) > 0:
             # A power of two, as each is kept.
             least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / np.abs(self.values).max()))
-        K, unit, to_free = prepared.dual(n_f, float(least))
+        K, unit, _, to_free = prepared.dual(n_f, float(least))
         scale = unit[group]
         lb, ub = theta.lb[:, of], theta.ub[:, of]
         with np.errstate(invalid="ignore"):

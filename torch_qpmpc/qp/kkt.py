@@ -14,7 +14,8 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, flatten_batch, schema, times
-from torch_qpmpc.qp.kernels.batched import hold, largest, multiply, null_space_inverses
+from torch_qpmpc.qp.kernels.active_set import hold
+from torch_qpmpc.qp.kernels.batched import largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
@@ -179,19 +180,22 @@ def _solve_active(
     H is factorised once for each theta, and the Schur complement of the active rows for each QP.
     """
     group = to_tensor(programs.group)
-    to_g, to_lam = map(to_tensor, programs.prepared.sensitivities(programs.n_f))
-    rows = to_tensor(programs.prepared.reduced(programs.n_f).rows)
+    dual = programs.prepared.dual(programs.n_f)
+    _, unit, inverse, to_v = map(to_tensor, dual)
+    unit, rows = unit[group], to_tensor(programs.prepared.reduced(programs.n_f).rows)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
-    size = terms = largest(right_v) * 0
+    held, size = active[:, rows], largest(right_v) * 0
+    terms = size
     regular = size < 0
     for _ in range(PASSES):
-        free = multiply(to_g.mT, group, of_v)
-        vy, dt = hold(to_lam, group, free, active[:, rows], of_t[:, rows])
-        dv = vy[:, : v.shape[-1]]
-        v, t = v + dv, t.index_add(1, rows, dt)
+        free, change = multiply(inverse, group, of_v), multiply(to_v, group, of_v)
+        change = change - of_t[:, rows] / unit
+        dt = to_tensor(hold(dual.K, programs.group, held.numpy(), change.numpy()))
+        dv = free - multiply(to_v.mT, group, dt)
+        v, t = v + dv, t.index_add(1, rows, dt / unit)
         of_v = right_v - multiply(H, group, v) - multiply(G.mT, group, t)
         of_t = torch.where(active, right_t - multiply(G, group, v), 0)
-        size = size + largest(dv) + largest(free[:, : v.shape[-1]])  # the active rows may cancel v
+        size = size + largest(dv) + largest(free)  # the active rows may cancel v
         terms = largest(right_v) + largest(H.flatten(1))[group] * size
         of_rows = right_t.abs() + largest(G)[group] * size.unsqueeze(-1)
         regular = (largest(of_v) <= REGULAR * terms) & (of_t.abs() <= REGULAR * of_rows).all(-1)

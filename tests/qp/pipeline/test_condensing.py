@@ -13,11 +13,10 @@ from torch_qpmpc.qp.pipeline.arrays import SoftQPs, Theta, to_tensor
 from torch_qpmpc.qp.pipeline.condensing import (
     SHIFT,
     Elimination,
-    Reduced,
     condense,
+    dual,
     in_order,
     inverse_factors,
-    sensitivities,
     sizes,
 )
 from torch_qpmpc.qp.solve import solve
@@ -132,18 +131,16 @@ def test_a_prediction_beyond_float64_has_no_recursion():
 
 
 @pytest.mark.parametrize("r", [0, 3, 9])
-def test_sensitivities_solve_the_unconstrained_qp(r):
+def test_multipliers_give_the_solution_and_its_rows(r):
     root, G = normal(2, 5, 5), normal(2, r, 5, seed=1)
     H = root @ root.mT
-    none = np.empty(0)
-    reduced = Reduced._make((none, none, H.numpy(), G.numpy(), *[none] * 6))
-    to_g, to_lam = map(torch.from_numpy, sensitivities(reduced))
+    K, unit, inverse, rows = map(torch.from_numpy, dual(H.numpy(), G.numpy()))
     g, lam = normal(5, seed=2), normal(r, seed=3)
     for m in range(2):
-        v = torch.linalg.solve(H[m], -g - G[m].mT @ lam)
-        assert_close(-g @ to_g[m] - lam @ to_lam[m], torch.cat((v, G[m] @ v)))
-    singular = reduced._replace(H=np.zeros((2, 5, 5)))
-    assert np.isnan(sensitivities(singular).to_g).all()
+        v = torch.linalg.solve(H[m], -g - G[m].mT @ (lam / unit[m]))
+        assert_close(-inverse[m] @ g - rows[m].mT @ lam, v)
+        assert_close((-rows[m] @ g - K[m] @ lam) * unit[m], G[m] @ v)
+        assert_close(K[m].diagonal(), torch.ones(r).double())
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])

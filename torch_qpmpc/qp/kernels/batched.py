@@ -1,4 +1,4 @@
-"""Batched linear algebra in torch, on the device of its tensors: products, and held rows."""
+"""Batched linear algebra in torch, on the device of its tensors."""
 
 from __future__ import annotations
 
@@ -45,42 +45,3 @@ def null_space_inverses(
     least = flat * largest(H.flatten(1))
     of_H = torch.linalg.pinv(null @ H @ null.mT, atol=least, rtol=0 * least, hermitian=True)
     return inverse, null.mT @ of_H @ null, kept.sum(-1)
-
-
-def hold(to_lam, group, vy, held, level) -> tuple[Tensor, Tensor]:
-    """Return v and y with the ``held`` rows at their levels, and their multipliers."""
-    d, t = vy.shape[-1] - held.shape[-1], torch.zeros_like(level)
-    order, real = _order(held)
-    factor = _factor_held(to_lam[:, :, d:], group, order, real)
-    order = order * real
-    short = (vy[:, d:].gather(1, order) - level.gather(1, order)).masked_fill_(~real, 0)
-    change = torch.cholesky_solve(short.unsqueeze(-1), factor).squeeze(-1)
-    t = t.scatter_add_(1, order, change)
-    return vy - multiply(to_lam.mT, group, t), t
-
-
-def _order(held: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the indices of the held rows, padded with r, and the mask of real ones, ``(B, k)``.
-
-    k is the largest number of held rows in a QP.
-    """
-    n_qps, r = held.shape
-    position = held.cumsum(-1)
-    k = int(position[:, -1].max()) if held.numel() else 0
-    order = torch.full((n_qps, k + 1), r, device=held.device)
-    # Rows that are not held are written to an extra last column.
-    index = torch.arange(r, device=held.device).expand(n_qps, r)
-    order.scatter_(1, torch.where(held, position - 1, k), index)
-    return order[:, :k], torch.arange(k, device=held.device) < position[:, -1:]
-
-
-def _factor_held(K: Tensor, group: Tensor, order: Tensor, real: Tensor) -> Tensor:
-    """Return the factor of K's rows and columns ``order`` ``(B, k)``; padding is an identity."""
-    K = F.pad(K, (0, 1, 0, 1))  # for the padding
-    n = K.shape[-1]
-    index = order.unsqueeze(-1) * n + order.unsqueeze(-2)
-    if len(K) > 1:
-        index += (group * n * n)[:, None, None]
-    K = torch.take(K, index)
-    K.diagonal(dim1=-2, dim2=-1).add_(~real)
-    return torch.linalg.cholesky_ex(K).L

@@ -1,14 +1,10 @@
 """Branch and bound over actions on levels, as loops that Numba compiles for the CPU.
 
 A *decision* is the level of one action in one stage; its row of G is held between the lowest and
-the highest level that are left to it. A node of the tree is a QP in the multipliers lam of the
-rows, scaled to ``K_ii = 1``,
-
-    y = free - K lam,   K = G H^-1 G',
-
-which a dual active-set method solves as ``policy.c`` does. Multipliers stay feasible whatever the
-levels, so each node starts from the last one's, and the dual cost, which never falls, ends a node
-as soon as it exceeds the best plan's. The search goes deep first, into the nearer levels: it soon
+the highest level that are left to it. A node of the tree is a QP that
+`torch_qpmpc.qp.kernels.active_set` solves. Multipliers stay feasible whatever the levels, so each
+node starts from the last one's, and the dual cost ends a node as soon as it exceeds the best
+plan's. The search goes deep first, into the nearer levels: it soon
 has a plan, and its memory is one branch.
 
 Minimum times and start costs are no rows: an automaton of each action, on or off (its lowest
@@ -18,24 +14,15 @@ least cost of starts to the node's bound.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from torch_qpmpc.qp.kernels.active_set import solve
 from torch_qpmpc.qp.kernels.linalg import compiled
 
-#: Errors of a row that count as rounding, relative to its terms and to the sum of multipliers.
-TOLERANCE, ROUNDING = 1e-13, 4e-15
-#: A row with a smaller pivot depends on the held ones; smaller entries are rounding.
-DEPENDENT, NOISE = 1e-11, 1e-9
 #: A plan replaces the best one if it costs less by this fraction.
 GAIN = 1e-13
-#: A violation up to this fraction of a row's terms does not prove that there is no plan.
-FEASIBLE = 1e-8
 #: A row is on a level within this fraction of the levels' distance.
 ON_LEVEL = 1e-9
-#: The most changes of the active set in one node.
-MAX_STEPS = 2000
 #: Outcomes of a search: the best plan, the best of as many nodes as may be, no plan, none found.
 BEST, CAPPED, NONE, UNKNOWN = 0, 1, 2, 3
 
@@ -102,7 +89,7 @@ def search(
                         if rows[a, k] >= 0:
                             low[rows[a, k]] = levels[a, k, first[a, k]]
                             high[rows[a, k]] = levels[a, k, last[a, k]]
-                n, least = _solve(
+                n, least, _ = solve(
                     K[group[i]], free[i], low, high, w[i],
                     lam, y, side, held, n, factor, x, limit - cost,
                 )  # fmt: skip
@@ -222,183 +209,3 @@ def _allowed(firsts, lasts, rules, starts, runs, ahead):
             last[k] = last[k] if on_ends else 0
         total += cost
     return total
-
-
-@compiled
-def _append(K, row, held, n, factor, x):
-    """Append a row to the factor; return False if it depends on the held ones.
-
-    x becomes L^-1 K[held, row] in either case.
-    """
-    pivot = K[row, row]
-    for a in range(n):
-        total = K[row, held[a]]
-        for b in range(a):
-            total -= factor[a, b] * x[b]
-        x[a] = total / factor[a, a]
-        pivot -= x[a] * x[a]
-    if pivot <= DEPENDENT:
-        return False
-    for a in range(n):
-        factor[n, a] = x[a]
-    factor[n, n] = math.sqrt(pivot)
-    held[n] = row
-    return True
-
-
-@compiled
-def _transposed(factor, x, n):
-    """Solve L'x = x."""
-    for a in range(n - 1, -1, -1):
-        total = x[a]
-        for b in range(a + 1, n):
-            total -= factor[b, a] * x[b]
-        x[a] = total / factor[a, a]
-
-
-@compiled
-def _drop(K, at, lam, side, held, n, factor, x):
-    """Drop the held row at a position; return the number of those left."""
-    last, n = n, at
-    for a in range(at + 1, last):
-        row = held[a]
-        if _append(K, row, held, n, factor, x):
-            n += 1
-        else:
-            lam[row], side[row] = 0.0, 0
-    return n
-
-
-@compiled
-def _longest(lam, side, w, low, high, held, x, n, noise, most):
-    """Return the longest step along x, where it stops (-1 at its end), and the multiplier there."""
-    stop, end = -1, 0.0
-    for a in range(n):
-        j = held[a]
-        equal = low[j] == high[j]
-        if x[a] > 0:
-            to = w[j] if side[j] > 0 or equal else 0.0
-        else:
-            to = -w[j] if side[j] < 0 or equal else 0.0
-        if abs(x[a]) > noise and abs(to) < np.inf and abs(most * x[a]) > abs(to - lam[j]):
-            most = max(0.0, (to - lam[j]) / x[a])
-            stop, end = a, to
-    return most, stop, end
-
-
-@compiled
-def _solve(K, free, low, high, w, lam, y, side, held, n, factor, x, cutoff):
-    """Solve a node from multipliers; return the number of held rows and the dual cost.
-
-    The cost is inf without a plan, and at least ``cutoff`` if the node ends early.
-    """
-    r, a = len(free), 0
-    for j in range(r):
-        side[j] = 0 if side[j] == 3 else side[j]
-    while a < n:  # the levels may have changed
-        j = held[a]
-        side[j] = 1 if lam[j] > 0 else -1 if lam[j] < 0 else side[j]
-        if not abs(high[j] if side[j] > 0 else low[j]) < np.inf:
-            lam[j], side[j] = 0.0, 0
-            n = _drop(K, a, lam, side, held, n, factor, x)
-            continue
-        a += 1
-    _respond(K, free, lam, y)
-    value, refined = -np.inf, 0
-    for _ in range(MAX_STEPS):
-        left, moved = 1.0, n > 0
-        while n:  # the held multipliers to their optimum, letting go those that meet an end
-            for a in range(n):
-                j = held[a]
-                total = left * (y[j] - (high[j] if side[j] > 0 else low[j]))
-                for b in range(a):
-                    total -= factor[a, b] * x[b]
-                x[a] = total / factor[a, a]
-            _transposed(factor, x, n)
-            step, stop, end = _longest(lam, side, w, low, high, held, x, n, 0.0, 1.0)
-            for a in range(n):
-                lam[held[a]] += step * x[a]
-            if stop < 0:
-                break
-            j = held[stop]
-            lam[j], side[j] = end, (2 if end > 0 else -2 if end < 0 else 0)
-            n = _drop(K, stop, lam, side, held, n, factor, x)
-            left *= 1.0 - step
-        if moved:
-            _respond(K, free, lam, y)
-        value, total = 0.0, 0.0
-        for j in range(r):
-            total += abs(lam[j])
-            if lam[j] != 0:
-                value += lam[j] * (0.5 * (free[j] + y[j]) - (high[j] if lam[j] > 0 else low[j]))
-        if value >= cutoff:
-            return n, value
-        row, gain, excess, to, settled = -1, 0.0, 0.0, 0, True
-        for j in range(r):
-            above, below, off = y[j] - high[j], y[j] - low[j], 0.0
-            if side[j] == 0:
-                off = above if above > 0 else below if below < 0 else 0.0
-            elif side[j] == 2:
-                off = min(above, 0.0)
-            elif side[j] == -2:
-                off = max(below, 0.0)
-            elif abs(side[j]) == 1:
-                off = above if side[j] > 0 else below
-            near = min(abs(high[j]), abs(low[j]))
-            if not abs(off) > TOLERANCE * (abs(free[j]) + near) + ROUNDING * total:
-                continue
-            if abs(side[j]) == 1:
-                settled = False
-                continue
-            length = min(abs(off), w[j])
-            if length * (abs(off) - length / 2) > gain:
-                gain = length * (abs(off) - length / 2)
-                row, excess = j, off
-                to = (1 if off > 0 else -1) if side[j] == 0 else side[j] // 2
-        if row < 0:
-            if settled or refined == 3:
-                return n, value
-            refined += 1
-            continue
-        sign = 1.0 if excess > 0 else -1.0
-        while True:
-            if _append(K, row, held, n, factor, x):
-                n += 1
-                side[row] = to
-                break
-            _transposed(factor, x, n)
-            for a in range(n):
-                x[a] *= -sign
-            equal = low[row] == high[row]
-            if sign > 0:
-                own = w[row] if to > 0 or equal else 0.0
-            else:
-                own = -w[row] if to < 0 or equal else 0.0
-            most = abs(own - lam[row])
-            step, stop, end = _longest(lam, side, w, low, high, held, x, n, NOISE, most)
-            if step == np.inf:
-                if abs(excess) > FEASIBLE * (abs(free[row]) + near):
-                    return n, np.inf
-                side[row] = 3  # rounding of rows that depend on each other
-                break
-            for a in range(n):
-                lam[held[a]] += step * x[a]
-            lam[row] += sign * step
-            if stop < 0:
-                lam[row], side[row] = own, (2 if own > 0 else -2 if own < 0 else 0)
-                break
-            j = held[stop]
-            lam[j], side[j] = end, (2 if end > 0 else -2 if end < 0 else 0)
-            n = _drop(K, stop, lam, side, held, n, factor, x)
-    return n, value
-
-
-@compiled
-def _respond(K, free, lam, y):
-    """y = free - K lam."""
-    for j in range(len(y)):
-        y[j] = free[j]
-    for i in range(len(lam)):
-        if lam[i] != 0:
-            for j in range(len(y)):
-                y[j] -= lam[i] * K[i, j]

@@ -27,12 +27,6 @@ lies between two others, in v, the variables that C z = b leaves free:
 largest of 1/2 z'Hz, q'z, w'sigma and their sum, or to a millionth of the *swing* if that is larger:
 the sum of ``|Hz + q| (ub - lb)`` over the entries with hard bounds, by which the cost changes, to
 first order, between these bounds. Where the cost is zero, its errors are small beside the swing.
-
-With a fixed active set, the KKT conditions are linear. The Schur complement of H solves them, with
-one Cholesky factor per QP, of the active part of K = G H^-1 G'. A warm start tries the active set
-of a nearly equal QP: between two visits to a transition theta changes little, and most active sets
-stay the same. If the signs of the solution contradict the set, the rows concerned change their
-state, and the new set is tried. QPs that do not settle go to the backend.
 """
 
 from __future__ import annotations
@@ -58,12 +52,6 @@ SOLVED, NOT_CONVERGED = int(Status.SOLVED), int(Status.NOT_CONVERGED)
 #: A row without free variables that is violated by more, or whose violation costs more than the
 #: second, has its weight as multiplier.
 VIOLATED, COSTLY = 1e-9, 1e-7
-#: Largest number of active sets that a warm start tries for one QP.
-MAX_STEPS = 10
-#: Largest number of solves of one system: the first, and refinements.
-MAX_PASSES = 3
-#: Relative tolerance for bounds and for signs of multipliers in a warm start.
-SLIP = 1e-9
 #: Errors of the value are relative to its largest term, but to no more than this many times the
 #: value (where z is far along a flat direction, huge terms cancel), and to no less than the floor
 #: and this share of the swing: a cost of zero has no digits of its own.
@@ -517,139 +505,3 @@ def _floor(below, above):
     """Return the smaller nonzero bound of a row, between `LEAST` and one."""
     near = min(abs(below) if below != 0 else np.inf, abs(above) if above != 0 else np.inf)
     return min(max(near, LEAST), 1.0)
-
-
-@compiled
-def recall(active, sensitivities, group, fixed, theta, reduced, sizes):
-    """Solve QPs from active sets ``(B, n_g)``, corrected where needed; complete and certify them.
-
-    Returns:
-        What `recover` does; NOT_CONVERGED where no set settled.
-    """
-    d, r, w = reduced.H.shape[1], len(reduced.rows), reduced.w
-    g_l_u = offsets(fixed, group, reduced.matrix, reduced.constant)
-    g, lower, upper = g_l_u[:, :d].copy(), g_l_u[:, d : d + r].copy(), g_l_u[:, d + r :].copy()
-    codes = np.empty(lower.shape, np.int8)
-    for i in range(len(codes)):
-        for k in range(r):
-            codes[i, k] = active[i, reduced.rows[k]]
-    to_g, to_lam = sensitivities.to_g, sensitivities.to_lam
-    v, lam, steps, done = _try_active_sets(to_g, to_lam, group, g, lower, upper, w, codes)
-    passes = np.int64(0)  # Python's type: a literal 0 would be compiled once more
-    parts = recover(v, lam, steps, group, fixed, theta, reduced, sizes, passes)
-    for i in range(len(done)):
-        if not done[i]:
-            parts[5][i], parts[6][i] = NOT_CONVERGED, np.inf
-    return parts
-
-
-@compiled
-def _try_active_sets(to_g, to_lam, group, g, lower, upper, w, active):
-    n_qps, r = lower.shape
-    d = g.shape[1]
-    nothing = np.empty((0, 2), np.int64)
-    free = -transposed_products(to_g, group, g, nothing)  # (v, y) without multipliers
-    lam, vy, steps = np.zeros((n_qps, r)), free.copy(), np.zeros(n_qps, np.int64)
-    done = np.zeros(n_qps, np.bool_)
-    code, held, level = np.empty(r, np.int8), np.empty(r, np.int64), np.empty(r)
-    factor, change = np.empty((r, r)), np.empty(r)
-    for i in range(n_qps):
-        copy(code, active[i])
-        to_lam_i = to_lam[group[i]]
-        for j in range(r):
-            if not -2 <= code[j] <= 2:
-                code[:] = 0
-        while not done[i] and steps[i] < MAX_STEPS:
-            steps[i] += 1
-            copy(vy[i], free[i])
-            k = 0
-            for j in range(r):
-                lam[i, j] = 0.0
-                if abs(code[j]) == 2:
-                    lam[i, j] = math.copysign(w[i % len(w), j], code[j])
-                    add(vy[i], -lam[i, j], to_lam_i[j])
-                elif code[j] != 0:
-                    level[j] = upper[i, j] if code[j] > 0 else lower[i, j]
-                    held[k] = j
-                    k += 1
-            if not _hold_rows(to_lam_i, held[:k], level, SLIP, vy[i], lam[i], factor, change):
-                break
-            done[i] = not _correct(code, lam[i], vy[i, d:], lower[i], upper[i], w[i % len(w)])
-    return vy[:, :d].copy(), lam, steps, done
-
-
-@compiled
-def _hold_rows(to_lam, held, level, slip, vy, t, factor, change):
-    """Add to t and vy the multipliers and their effect; return False if there is no factor."""
-    k, d = len(held), len(vy) - len(t)
-    if not _factorise_held(to_lam, held, k, d, factor):
-        return False
-    for _ in range(MAX_PASSES):
-        unmet = False
-        for a in range(k):
-            at = level[held[a]]
-            change[a] = vy[d + held[a]] - at
-            unmet = unmet or not abs(change[a]) <= slip * (1.0 + abs(at))
-        if not unmet:
-            break
-        _solve_factorised(factor, change, k)
-        for a in range(k):
-            t[held[a]] += change[a]
-            add(vy, -change[a], to_lam[held[a]])
-    return True
-
-
-@compiled
-def _factorise_held(to_lam, held, k, d, factor):
-    """Factorise the held rows and columns of K in place; return False if there is no factor."""
-    for a in range(k):
-        for b in range(a, k):
-            factor[a, b] = to_lam[held[a], d + held[b]]
-    for a in range(k):
-        if not factor[a, a] > 0:
-            return False
-        root = math.sqrt(factor[a, a])
-        for b in range(a, k):
-            factor[a, b] /= root
-        # A call with slices of rows would take as long as these loops.
-        for b in range(a + 1, k):
-            for e in range(b, k):
-                factor[b, e] -= factor[a, b] * factor[a, e]
-    return True
-
-
-@compiled
-def _solve_factorised(factor, x, k):
-    for a in range(k):
-        x[a] /= factor[a, a]
-        for b in range(a + 1, k):
-            x[b] -= x[a] * factor[a, b]
-    for a in range(k - 1, -1, -1):
-        for b in range(a + 1, k):
-            x[a] -= factor[a, b] * x[b]
-        x[a] /= factor[a, a]
-
-
-@compiled
-def _correct(code, lam, y, lower, upper, w):
-    """Correct the codes in place; return True if lam and y contradicted them."""
-    contradicted = False
-    for j in range(len(code)):
-        small = SLIP * (1.0 + abs(y[j]))
-        above, below = y[j] > upper[j] + small, y[j] < lower[j] - small
-        over = abs(lam[j]) > (1.0 + SLIP) * w[j]
-        inwards = lam[j] * code[j] < -SLIP * (1.0 + abs(lam[j]))
-        if over or inwards or ((above or below) and abs(code[j]) < 2):
-            contradicted = True
-        if code[j] == 0:
-            code[j] = 1 if above else -1 if below else 0
-        elif abs(code[j]) == 2:
-            # A saturated row that is back within its bounds is held.
-            if y[j] < upper[j] - small if code[j] > 0 else y[j] > lower[j] + small:
-                code[j] //= 2
-        elif over:
-            code[j] = 2 if lam[j] > 0 else -2
-        elif inwards and lower[j] < upper[j]:
-            # A row whose multiplier points inwards is released, unless its bounds are equal.
-            code[j] = 0
-    return contradicted

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.qp.kernels import sample
+from torch_qpmpc.qp.kernels import active_set, sample
 from torch_qpmpc.qp.pipeline.arrays import (
     BackendSolution,
     BatchSolution,
@@ -28,15 +28,14 @@ from torch_qpmpc.qp.pipeline.arrays import (
 )
 from torch_qpmpc.qp.pipeline.condensing import (
     Condensed,
+    Dual,
     Elimination,
     Reduced,
-    Sensitivities,
     Sizes,
     condense,
     convex,
-    inverse_factors,
+    dual,
     reduce,
-    sensitivities,
     sizes,
 )
 from torch_qpmpc.qp.pipeline.scaling import Units
@@ -133,33 +132,21 @@ class Prepared:
         return None if surely or (mask := convex(self.reduced(n_f).H)).all() else mask
 
     @kept
-    def sensitivities(self, n_f: int) -> Sensitivities:
-        """Return the `Sensitivities` of the reduced QPs."""
-        return sensitivities(self.reduced(n_f))
-
-    @kept
     def sizes(self, n_f: int) -> Sizes:
         """Return the `Sizes` of the reduced QPs."""
         return sizes(self.condensed(n_f), self.theta, n_f)
 
     @kept
-    def dual(self, n_f: int, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return K = G H^-1 G' with a unit diagonal, its units, and the map of -g to the rows.
-
-        They are ``(M, r, r)``, ``(M, r)`` and ``(M, r, d)``. ``least`` is added to H's diagonal.
-        """
+    def dual(self, n_f: int, least: float = 0.0) -> Dual:
+        """Return the `Dual` of the reduced QPs, with ``least`` added to H's diagonal."""
         _, _, H, G, *_ = self.reduced(n_f)
-        inverse, _ = inverse_factors(H + least * np.eye(H.shape[-1]))
-        R = G @ inverse.swapaxes(1, 2)
-        unit = np.linalg.norm(R, axis=-1)
-        R = R / unit[:, :, None]
-        return R @ R.swapaxes(1, 2), unit, R @ inverse
+        return dual(H + least * np.eye(H.shape[-1]), G)
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""
         theta = self.theta._replace(lb=lb, ub=ub)
         other = Prepared(theta, self.group, self.n_kept, self._elimination)
-        same = ("_condensed", "convex", "sensitivities", "sizes")
+        same = ("_condensed", "convex", "dual", "sizes")
         other.known = {key: x for key, x in self.known.items() if key[0] in same}
         vars(other)["units"] = self.units
         if self.units is not None:
@@ -327,11 +314,10 @@ class Programs:
         """Solve the QPs from active sets ``(B, n_g)``, corrected where needed, and certify them.
 
         The warm start of every solver, for the whole batch at once. Codes are those of
-        `QPSolution.active`; a set with any other code starts as the empty one, and usually settles.
-        The residual is infinite where a set does not.
+        `QPSolution.active`; a set with any other code starts as the empty one.
         """
-        sensitivities = self.prepared.sensitivities(self.n_f)
-        return BatchSolution(*sample.recall(active, sensitivities, *self.data()))
+        dual = self.prepared.dual(self.n_f)
+        return BatchSolution(*active_set.recall(active, dual, *self.data()))
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.

@@ -134,14 +134,18 @@ class Sizes(NamedTuple):
     spans: tuple[Array, ...]
 
 
-class Sensitivities(NamedTuple):
-    """The response ``-to_g'g - to_lam'lam`` of (v, y = G v) to g and multipliers.
+class Dual(NamedTuple):
+    """The QPs in the multipliers of their rows: v is ``-inverse g - rows' lam``, and G v its rows.
 
-    ``to_g = H^-1 [I, G']`` is ``(M, d, d + r)``, and ``to_lam = G to_g`` is ``(M, r, d + r)``.
+    In units ``unit`` ``(M, r)`` of the rows they are ``-rows g - K lam``, and ``K = G H^-1 G'``
+    ``(M, r, r)`` has a unit diagonal. ``inverse`` is that of H, ``(M, d, d)``, ``rows = G H^-1``,
+    ``(M, r, d)``.
     """
 
-    to_g: Array
-    to_lam: Array
+    K: Array
+    unit: Array
+    inverse: Array
+    rows: Array
 
 
 @np.errstate(all="ignore")  # predictions of unstable models may overflow
@@ -256,15 +260,13 @@ def _index_of(rows: np.ndarray) -> np.ndarray:
 
 
 @np.errstate(all="ignore")
-def sensitivities(reduced: Reduced) -> Sensitivities:
-    """Return the `Sensitivities` of reduced QPs, NaN if an H is singular."""
-    try:
-        inverse = np.linalg.inv(reduced.H)
-    except np.linalg.LinAlgError:
-        inverse = np.full_like(reduced.H, np.nan)
-    y = reduced.G @ inverse
-    to_g = np.concatenate((inverse, y.swapaxes(1, 2)), axis=-1)
-    return Sensitivities(to_g, np.concatenate((y, y @ reduced.G.swapaxes(1, 2)), axis=-1))
+def dual(H: np.ndarray, G: np.ndarray) -> Dual:
+    """Return the `Dual` of reduced QPs; that of a singular H is of one that is shifted."""
+    inverse, _ = inverse_factors(H)
+    R = G @ inverse.swapaxes(1, 2)
+    unit = np.linalg.norm(R, axis=-1)
+    R = R / unit[:, :, None]
+    return Dual(R @ R.swapaxes(1, 2), unit, inverse.swapaxes(1, 2) @ inverse, R @ inverse)
 
 
 def convex(H: np.ndarray) -> np.ndarray:
