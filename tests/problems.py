@@ -10,13 +10,12 @@ from torch import Tensor
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.analysis.structure import PredictionForm, prediction_form
 from torch_qpmpc.mpc.layout import banded_matrix
-from torch_qpmpc.qp.kernels import sample, sample_torch
+from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.kernels.batched import multiply
 from torch_qpmpc.qp.kernels.sample import Terms
-from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs, Theta, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import Reduced
-from torch_qpmpc.qp.pipeline.device import on_device
 from torch_qpmpc.qp.solvers import BackendSolution
 
 #: Positions of a row at the solution: inside its bounds, at one, or (if soft) beyond one.
@@ -184,33 +183,23 @@ def programs_of(known: KnownQP) -> Programs:
     return Programs.of(*known.qp.tensors(), known.fixed)[0]
 
 
-def in_torch(p: Programs) -> tuple[Any, ...]:
-    """Return the arguments of the kernels' torch forms after the candidate, on the CPU."""
-    group, fixed = torch.from_numpy(p.group), torch.from_numpy(p.fixed)
-    return group, fixed, *on_device(p.prepared, torch.device("cpu"), p.n_f)
-
-
 def within(lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
     """Return lam within [-w, w], on the side of a bound, as candidates are before the judge."""
     inside = torch.where(lam.isnan(), lam, lam.clamp(-w, w))
     return torch.where(torch.where(lam > 0, ub.isinf(), (lam < 0) & lb.isinf()), 0.0, inside)
 
 
-def certified(p: Programs, *claim: Tensor, compiled: bool = True) -> tuple[Tensor, ...]:
+def certified(p: Programs, *claim: Tensor) -> tuple[Tensor, ...]:
     """Return value, residual and error of a value of the ``claim`` z, lam, chi, xi."""
     z, lam, chi, xi = claim
-    group, _, theta, *_ = in_torch(p)
+    group, theta = torch.from_numpy(p.group), Theta._make(map(torch.from_numpy, p.theta))
     lam = within(lam, theta.lb, theta.ub, theta.w)
     Hz, y, Cz = (multiply(x, group, z) for x in (theta.H, theta.G, theta.C))
     G_lam, C_chi = multiply(theta.G.mT, group, lam), multiply(theta.C.mT, group, chi)
     left = Hz + theta.q + G_lam + C_chi
     left[:, : xi.shape[-1]] += xi
-    terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
-    if not compiled:
-        group, fixed, theta, reduced, sizes = in_torch(p)
-        return sample_torch.judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
-    arrays = Terms._make(x.contiguous().numpy() for x in terms)
-    found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), arrays)
+    terms = Terms._make(x.contiguous().numpy() for x in (Hz, G_lam, C_chi, left, y, Cz))
+    found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), terms)
     return (*map(torch.from_numpy, found),)
 
 

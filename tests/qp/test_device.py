@@ -17,9 +17,9 @@ import torch_qpmpc as qm
 from tests.problems import BRINK, HARD_ROWS, MIXED, SOFT_ROWS, WEAK, known_qp, normal, random_mpc
 from tests.problems import random_states as states
 from torch_qpmpc.envs import PointMass, PointMassEnv
-from torch_qpmpc.qp.pipeline import device, solve
+from torch_qpmpc.qp.pipeline import solve
 from torch_qpmpc.qp.solution import QPSolution
-from torch_qpmpc.qp.solvers import BACKENDS
+from torch_qpmpc.qp.solvers import BACKENDS, interior_point
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -220,7 +220,7 @@ def point_mass(count: int) -> tuple[qm.QPMPC, Tensor, Tensor]:
 def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
     """Its method fails on half of the batch, and then on all of it."""
     mpc, s, _ = point_mass(8)
-    expected, whole = mpc.solve(s), device.interior_point.solve
+    expected, whole = mpc.solve(s), interior_point.solve
     for wrong in (slice(None, None, 2), slice(None)):
 
         def spoilt(qps: Any, wrong: slice = wrong) -> Any:
@@ -228,7 +228,7 @@ def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
             answer.v[wrong] = torch.nan
             return answer
 
-        monkeypatch.setattr(device.interior_point, "solve", spoilt)
+        monkeypatch.setattr(interior_point, "solve", spoilt)
         monkeypatch.setitem(BACKENDS, "torch", BACKENDS["daqp"])
         with in_tensors():
             solution = mpc.to(DEVICE).solve(s.to(DEVICE))

@@ -51,12 +51,6 @@ def row_states(p: Tensor, lower: Tensor, upper: Tensor, w: Tensor) -> tuple[Tens
     return bound, active, multiplier
 
 
-def active_codes(y: Tensor, lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> Tensor:
-    """Return `QPSolution.active` of rows y = G z with multipliers lam, ``(*batch, n_g)``."""
-    _, active, multiplier = row_states(y + lam, lb, ub, w)
-    return torch.where(active, lam.sign(), 2 * multiplier.sign()).to(torch.int8)
-
-
 @dataclass(frozen=True, repr=False)
 class QPSolution:
     """Primal-dual solution of a batch of QPs.

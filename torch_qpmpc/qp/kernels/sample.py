@@ -1,7 +1,6 @@
 """Computations for each QP of a batch, as loops that Numba compiles for the CPU.
 
-`torch_qpmpc.qp.kernels.sample_torch` has the same functions for other devices. Arrays are float64
-and contiguous; a vector that the whole batch shares has one row.
+Arrays are float64 and contiguous; a vector that the whole batch shares has one row.
 
 The certificate judges the results of all backends, by a relative KKT residual and a bound of the
 value's error. For multipliers ``lam = eta - upsilon`` of the softened
@@ -32,6 +31,7 @@ first order, between these bounds. Where the cost is zero, its errors are small 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,7 +96,7 @@ def offsets(fixed, group, matrix, constant):
     return out
 
 
-@compiled
+@partial(compiled, nogil=True)
 def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     """Complete and certify solutions of reduced QPs.
 

@@ -1,7 +1,4 @@
-"""Arrays of the pipeline: data, reduced QPs, candidates of backends, certified solutions.
-
-They are NumPy's, on the CPU; `torch_qpmpc.qp.pipeline.device` fills the same tuples with tensors.
-"""
+"""Arrays of the pipeline: data, reduced QPs, candidates of backends, certified solutions."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from torch_qpmpc.qp.program import INFINITE, Status, crossed
 CONTRADICTED = 1e-7
 #: Optima that are further from zero have a length of their own.
 LONG = 2.0**10
-#: ``np.ndarray``; ``torch.Tensor`` within backends and on a device.
+#: ``np.ndarray``; ``torch.Tensor`` within backends.
 Array = Any
 
 

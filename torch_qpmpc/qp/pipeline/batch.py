@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -166,6 +167,8 @@ class Prepared:
         return Prepared(self.theta, self.group, n_f, elimination)
 
 
+#: The least number of QPs that are worth a thread.
+MANY = 1024
 #: The latest thetas that are kept: V and Q of an online and a target network.
 LATEST = 4
 _thread = threading.local()
@@ -323,9 +326,16 @@ class Programs:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
 
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
-        elimination.
+        elimination. Many QPs of one theta take torch's number of threads.
         """
-        return BatchSolution(*sample.recover(*candidate, *self.data(), passes))
+        rows, known = (*candidate, self.group, self.fixed), (*self.data()[2:], passes)
+        parts = min(torch.get_num_threads(), len(self) // MANY) if self.prepared.shared else 1
+        if parts < 2:
+            return BatchSolution(*sample.recover(*rows, *known))
+        with ThreadPoolExecutor(parts) as pool:
+            split = (np.array_split(x, parts) for x in rows)
+            found = pool.map(lambda *part: sample.recover(*part, *known), *split)
+            return BatchSolution._make(map(np.concatenate, zip(*found, strict=True)))
 
     def data(self) -> tuple:
         """Return the kernels' arguments after the candidate."""

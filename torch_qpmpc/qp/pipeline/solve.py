@@ -27,11 +27,10 @@ from torch_qpmpc.qp.pipeline.arrays import (
 )
 from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
-from torch_qpmpc.qp.pipeline.device import accelerator, attempt
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
-from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend
+from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, interior_point
 
 #: Backends that solve again, cold, what the chosen one leaves: they give up soonest, and solve all
 #: that ProxQP solves. The last is the same for each: none decides whether there is a solution.
@@ -150,6 +149,11 @@ def solve_now(*arguments: Any) -> BatchSolution:
     return BatchSolution._make(map(out, outputs))
 
 
+def accelerator(x: Tensor) -> torch.device | None:
+    """Return the device of x; None if that is the CPU."""
+    return x.device if x.is_cuda else None
+
+
 def report(status: np.ndarray, batch: torch.Size, on_failure: str) -> None:
     """Raise or warn about the unsolved QPs of a batch, by their `Status` ``(B,)``."""
     unsolved, reasons = np.flatnonzero(status), []
@@ -213,7 +217,7 @@ class AtRest:
 
 
 #: A step maps QPs without a certified solution, and their best candidates so far, to candidates;
-#: a device and backends ignore these, which the first has not.
+#: backends ignore these, which the first has not.
 Step = Callable[[Programs, Any], BatchSolution]
 
 
@@ -280,7 +284,7 @@ def steps_of(
     first, *others, last = map(backed, solves)
     refined = partial(_refined, log)
     return [
-        *([partial(attempt, device)] if device else []),
+        *([backed(partial(interior_point.solve_arrays, device=device))] if device else []),
         *([partial(_recalled, log)] if warm else []),
         first,
         partial(_if_few, refined),

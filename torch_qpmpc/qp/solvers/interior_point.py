@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.kernels.batched import largest
-from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
 from torch_qpmpc.qp.solution import row_states
 
 #: The largest absolute entry along the last dimension, which is kept.
@@ -252,9 +252,10 @@ def solve(qps: SoftQPs) -> BackendSolution:
     return BackendSolution(best.v, best.lam, best.steps)
 
 
-def solve_arrays(qps: SoftQPs) -> BackendSolution:
-    """Solve a batch of arrays."""
-    return BackendSolution._make(x.numpy() for x in solve(SoftQPs._make(map(to_tensor, qps))))
+def solve_arrays(qps: SoftQPs, device: torch.device | str = "cpu") -> BackendSolution:
+    """Solve a batch of arrays on a device."""
+    tensors = SoftQPs._make(torch.from_numpy(x).to(device) for x in qps)
+    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors))
 
 
 class Point(NamedTuple):
