@@ -78,6 +78,15 @@ def test_a_nonlinear_plant_has_networks(model):
     assert of_cost.shape == (3, 3)
 
 
+def test_a_quadratic_cost_has_no_network_on_a_nonlinear_plant():
+    log = pendulum_log()
+    v = np.concatenate([np.concatenate((x["y"][:-1], x["u"]), 1) for x in log])
+    model = identify_nonlinear(log, (v**2).sum(1) / 2)
+    assert model.depth == 6
+    x = torch.linspace(-2, 2, 9).double().unsqueeze(1).expand(9, 2)
+    assert_close(model(x, torch.zeros(9, 1))[1], x[:, 0] ** 2, rtol=0, atol=1e-6)
+
+
 def test_noise_does_not_hide_the_curvature():
     model = identify_nonlinear(pendulum_log(noise=0.05))
     assert model.depth == 6

@@ -147,14 +147,14 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
         base = torch.cat((base, _convex(linear, features, target[:, n_x:])), -1)
     mean, spread = target.mean(0), target.std(0, correction=0)
     rest = (target - features @ base).square().mean(0)
-    wanted, layers = rest > EXACT * spread.square(), ()
-    left = torch.ones_like(rest)
+    wanted, layers, left = rest > EXACT * spread.square(), (), torch.ones_like(rest)
     if wanted.any():
         spread = torch.where(spread > 0, spread, 1.0)
         layers, error = _trained(v.float(), ((target - mean) / spread).float())
         left = torch.where(wanted, error * spread.square() / rest, 1.0)
         W_1, b_1, W_2, b_2, W_3, b_3 = (x.detach().double() for x in layers)
-        used = (left < torch.where(torch.arange(len(left)) < n_x, LEFT, TIED)) * (left < LEFT).any()
+        most = torch.where(torch.arange(len(left)) < n_x, LEFT, TIED)
+        used = wanted * (left < most) * (left < LEFT).any()
         first = W_1.movedim(0, 1).flatten(1), b_1.flatten()
         last = (
             (W_3 / COUNT).flatten(0, 1) * spread * used,
