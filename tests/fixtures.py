@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import matplotlib
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 from hydra._internal.core_plugins.importlib_resources_config_source import (
     ImportlibResourcesConfigSource,
 )
@@ -161,6 +163,21 @@ def quick_figures(request: pytest.FixtureRequest) -> Iterator[None]:
             patch.setattr(Figure, "savefig", save_small)
             patch.setitem(matplotlib.rcParams, "figure.dpi", SMALL_DPI)
         yield
+
+
+@pytest.fixture
+def register(monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Return a function that registers an environment for a test, and returns its id."""
+
+    def add(
+        make: Callable[..., Any], steps: int | None = None, name: str = "", **options: Any
+    ) -> str:
+        id = name or f"{make.__name__}-v0"
+        spec = EnvSpec(id, lambda **more: make(**options | more), max_episode_steps=steps)
+        monkeypatch.setitem(gymnasium.registry, id, spec)
+        return id
+
+    return add
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
@@ -192,9 +191,8 @@ class Ends(gymnasium.Env):
 
 
 @pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
-def test_after_a_termination_nothing_costs_and_nothing_moves(monkeypatch, steps, reached):
-    monkeypatch.setitem(gymnasium.registry, "Ends-v0", EnvSpec("Ends-v0", lambda **_: Ends()))
-    run = gymnasium_loop(torch.zeros_like, GymnasiumPlant("Ends-v0"), steps=steps, starts=2)
+def test_after_a_termination_nothing_costs_and_nothing_moves(register, steps, reached):
+    run = gymnasium_loop(torch.zeros_like, GymnasiumPlant(register(Ends)), steps=steps, starts=2)
     assert run.states[..., 0].T.tolist() == [reached] * 2
     assert min(steps, 3) == run.J
     assert run.costs[3:].abs().sum() == 0

@@ -6,7 +6,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from torch_qpmpc.envs import GymnasiumPlant
@@ -30,18 +29,6 @@ class Counter(gymnasium.Env):
     def step(self, action):
         self.k, self.action = self.k + 1, action
         return np.full(1, self.k, np.float32), -float(self.k), self.k >= self.last, False, {}
-
-
-@pytest.fixture
-def register(monkeypatch):
-    """Register a `Counter` with given spaces or end, for one test."""
-
-    def add(**options):
-        spec = EnvSpec("Counter-v0", lambda **_: Counter(**options))
-        monkeypatch.setitem(gymnasium.registry, "Counter-v0", spec)
-        return "Counter-v0"
-
-    return add
 
 
 def test_the_bounds_are_those_of_its_spaces():
@@ -86,7 +73,7 @@ def test_an_unknown_environment_is_an_error(id):
 )
 def test_other_spaces_are_an_error(register, options, match):
     with pytest.raises(QPError, match=match):
-        GymnasiumPlant(register(**options))
+        GymnasiumPlant(register(Counter, **options))
 
 
 def test_further_arguments_are_those_of_its_environment():
@@ -102,13 +89,12 @@ def test_further_arguments_are_those_of_its_environment():
     assert not torch.equal(angles(0.0), angles(10.0))
 
 
-def test_episodes_have_the_environments_own_length(register, monkeypatch):
+def test_episodes_have_the_environments_own_length(register):
     assert GymnasiumPlant("Pendulum-v1").max_steps == 200
     assert GymnasiumPlant("MountainCarContinuous-v0").max_steps == 999
-    assert GymnasiumPlant(register()).max_steps == 200, "no limit of its own"
-    limited = EnvSpec("Limited-v0", lambda **_: gymnasium.wrappers.TimeLimit(Counter(), 4))
-    monkeypatch.setitem(gymnasium.registry, "Limited-v0", limited)
-    plant = GymnasiumPlant("Limited-v0")
+    assert GymnasiumPlant(register(Counter)).max_steps == 200, "no limit of its own"
+    limited = lambda: gymnasium.wrappers.TimeLimit(Counter(), 4)  # noqa: E731 (an entry point)
+    plant = GymnasiumPlant(register(limited, name="Limited-v0"))
     assert plant.max_steps == 4, "that of a wrapper"
     env = plant.vectorised(1, None, seed=0)
     assert env.rollout(9)["next", "done"].flatten().tolist() == [False] * 3 + [True]
@@ -119,7 +105,7 @@ def test_episodes_have_the_environments_own_length(register, monkeypatch):
 @pytest.mark.parametrize(("last", "length"), [(3, 3), (1000, 5)])
 def test_a_loop_knows_how_long_its_episodes_last(register, last, length):
     """A policy is asked for actions until the last one ends."""
-    plant, asked = GymnasiumPlant(register(last=last)), []
+    plant, asked = GymnasiumPlant(register(Counter, last=last)), []
     policy = lambda s: asked.append(s) or torch.zeros(len(s), 1)  # noqa: E731
     loop = gymnasium_loop(policy, plant, steps=5, starts=2)
     assert loop.lengths is not None
@@ -135,7 +121,7 @@ def test_unknown_arguments_of_an_environment_are_an_error():
 
 
 def test_actions_are_clipped_and_a_solvers_rounding_is_zero(register):
-    env = GymnasiumPlant(register()).make()
+    env = GymnasiumPlant(register(Counter)).make()
     own: Any = env.unwrapped
     env.reset(seed=0)
     for action, applied in ((1e-10, 0.0), (-0.5, -0.5), (3.0, 2.0), (-3.0, -1.0)):
@@ -147,7 +133,7 @@ def test_actions_are_clipped_and_a_solvers_rounding_is_zero(register):
 @pytest.mark.parametrize("most", [1e-9, 1e6, np.inf])
 def test_actions_in_any_unit_reach_the_plant(register, most):
     bounds = Box(-most, most, (1,), np.float64)
-    env = GymnasiumPlant(register(actions=bounds)).make()
+    env = GymnasiumPlant(register(Counter, actions=bounds)).make()
     own: Any = env.unwrapped
     env.reset(seed=0)
     size = most if np.isfinite(most) else 1e-12
@@ -157,7 +143,7 @@ def test_actions_in_any_unit_reach_the_plant(register, most):
 
 
 @pytest.mark.parametrize("kind", [Dict, Tuple])
-def test_parts_of_an_observation_become_one_vector(monkeypatch, kind):
+def test_parts_of_an_observation_become_one_vector(register, kind):
     class Parts(Counter):
         def __init__(self, **_) -> None:
             super().__init__()
@@ -179,8 +165,7 @@ def test_parts_of_an_observation_become_one_vector(monkeypatch, kind):
             _, *rest = super().step(action)
             return self.observe(), *rest
 
-    monkeypatch.setitem(gymnasium.registry, "Parts-v0", EnvSpec("Parts-v0", Parts))
-    plant = GymnasiumPlant("Parts-v0")
+    plant = GymnasiumPlant(register(Parts))
     assert plant.ub_s.tolist() == [9, 9, 1]
     env = plant.vectorised(2, 3, seed=0)
     batch = env.rollout(2)
@@ -191,7 +176,7 @@ def test_parts_of_an_observation_become_one_vector(monkeypatch, kind):
 
 
 def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(register):
-    env = GymnasiumPlant(register()).vectorised(2, 3, seed=0)
+    env = GymnasiumPlant(register(Counter)).vectorised(2, 3, seed=0)
     batch = env.rollout(7, break_when_any_done=False)
     env.close()
     assert batch.shape == (2, 7)
@@ -206,7 +191,7 @@ def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(re
 
 
 def test_a_terminated_episode_is_terminated(register):
-    env = GymnasiumPlant(register(last=2)).vectorised(1, 3, seed=0)
+    env = GymnasiumPlant(register(Counter, last=2)).vectorised(1, 3, seed=0)
     batch = env.rollout(4, break_when_any_done=False)
     env.close()
     assert batch["next", "terminated"].flatten().tolist() == [False, True, False, True]
@@ -233,11 +218,8 @@ class Fragile(Counter):
 
 @pytest.mark.filterwarnings("ignore:The plant ends an episode")
 @pytest.mark.parametrize("at", [1, 2, 4])
-def test_an_exception_ends_its_episode_alone(monkeypatch, at):
-    monkeypatch.setitem(
-        gymnasium.registry, "Fragile-v0", EnvSpec("Fragile-v0", lambda **x: Fragile(**x))
-    )
-    plant = GymnasiumPlant("Fragile-v0", at=at)
+def test_an_exception_ends_its_episode_alone(register, at):
+    plant = GymnasiumPlant(register(Fragile), at=at)
     loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
     assert loop.raised is not None
     assert loop.raised.tolist() == [False, True] * 2
@@ -256,11 +238,8 @@ def test_an_exception_ends_its_episode_alone(monkeypatch, at):
     assert len(plant.raised) > 2
 
 
-def test_a_wrong_use_of_an_environment_is_no_fault_of_the_plant(monkeypatch):
-    monkeypatch.setitem(
-        gymnasium.registry, "Fragile-v0", EnvSpec("Fragile-v0", lambda **x: Fragile(**x))
-    )
-    plant = GymnasiumPlant("Fragile-v0")
+def test_a_wrong_use_of_an_environment_is_no_fault_of_the_plant(register):
+    plant = GymnasiumPlant(register(Fragile))
     with pytest.raises(gymnasium.error.ResetNeeded):
         plant.make().step(np.zeros(1, np.float32))
     with pytest.warns(UserWarning, match="The plant ends an episode by FloatingPointError: the in"):

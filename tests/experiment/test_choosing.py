@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 from torch.testing import assert_close
 
 import train
@@ -65,18 +64,13 @@ BOUNDED = "task.observation_bounds=true"
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
 
-def plant_is(monkeypatch, kind):
-    make = lambda **kwargs: kind(**kwargs)  # noqa: E731 (an entry point)
-    monkeypatch.setitem(gymnasium.registry, "Lag-v0", EnvSpec("Lag-v0", make))
-
-
 @pytest.fixture(scope="module")
 def known_starts() -> dict[tuple[Any, ...], dict[str, Any]]:
     return {}
 
 
 @pytest.fixture(autouse=True)
-def _plant(monkeypatch, known_starts):
+def _plant(monkeypatch, register, known_starts):
     """Make the plant a lag, and fit the starts of the same settings and log once."""
 
     def once(cfg, physics, log):
@@ -85,7 +79,7 @@ def _plant(monkeypatch, known_starts):
             known_starts[key] = candidates(cfg, physics, log)
         return copy.deepcopy(known_starts[key])
 
-    plant_is(monkeypatch, Lag)
+    register(Lag, name="Lag-v0")
     monkeypatch.setattr(choosing, "candidates", once)
     monkeypatch.setattr(learned, "STEPS", 400)
 
@@ -104,8 +98,8 @@ def start_of(cfg, physics):
     return start._replace(action=torch.zeros(1, dtype=torch.float64))
 
 
-def test_the_candidates_have_the_stage_s_and_the_regulator_s_cost(monkeypatch):
-    plant_is(monkeypatch, Swing)
+def test_the_candidates_have_the_stage_s_and_the_regulator_s_cost(register):
+    register(Swing, name="Lag-v0")
     cfg = make_config(*DATA)
     physics: Any = make_physics(cfg)
     log = collect_log(cfg, physics)
@@ -151,8 +145,8 @@ class Certain(Lag):
         return self.y, -(self.y.item() ** 2) - self.price * np.abs(action).item(), False, False, {}
 
 
-def test_equal_episodes_decide_at_once(monkeypatch):
-    plant_is(monkeypatch, Certain)
+def test_equal_episodes_decide_at_once(register):
+    register(Certain, name="Lag-v0")
     choice = chosen(*DATA)[-1]
     assert choice.name != ZERO_ACTION
     assert choice.table.episodes.tolist() == [8, 8, 8]
@@ -250,8 +244,8 @@ class Periodic(Lag):
 
 
 @pytest.fixture
-def periodic(monkeypatch):
-    plant_is(monkeypatch, Periodic)
+def periodic(register):
+    register(Periodic, name="Lag-v0")
 
 
 @pytest.mark.usefixtures("periodic")
@@ -307,8 +301,8 @@ class Swing(Lag):
 
 
 @pytest.fixture
-def swing(monkeypatch):
-    plant_is(monkeypatch, Swing)
+def swing(register):
+    register(Swing, name="Lag-v0")
 
 
 @pytest.mark.usefixtures("swing")

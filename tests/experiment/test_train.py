@@ -11,7 +11,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from hydra import compose, initialize_config_dir
 
@@ -164,11 +163,9 @@ class Greenhouse(gymnasium.Env):
 
 
 @pytest.mark.filterwarnings("ignore:.*stage cost explains")
-def test_a_slow_plant_with_a_hidden_state_takes_few_qps_an_update(tmp_path, monkeypatch):
-    make: Any = Greenhouse
-    spec = EnvSpec("Greenhouse-v0", make, max_episode_steps=200)
-    monkeypatch.setitem(gymnasium.registry, "Greenhouse-v0", spec)
-    plant = ("task=gymnasium", "task.id=Greenhouse-v0", "start=data", "task.start_episodes=0")
+def test_a_slow_plant_with_a_hidden_state_takes_few_qps_an_update(tmp_path, register):
+    id = register(Greenhouse, 200)
+    plant = ("task=gymnasium", f"task.id={id}", "start=data", "task.start_episodes=0")
     plain = ("rivals=false", "figures=false", "gate=false", "task.eval_steps=5")
     cfg = make_config(*plant, *plain, "updates=6", "eval_interval=6")
     summary, table = train.train(cfg, str(tmp_path), quiet=True), metrics(tmp_path)
@@ -361,9 +358,8 @@ class Mass(gymnasium.Env):
 
 
 @pytest.fixture
-def mass(monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = EnvSpec("Mass-v0", lambda **options: Mass(**options), max_episode_steps=50)
-    monkeypatch.setitem(gymnasium.registry, "Mass-v0", spec)
+def mass(register: Callable[..., str]) -> None:
+    register(Mass, 50)
 
 
 @pytest.mark.usefixtures("mass")
