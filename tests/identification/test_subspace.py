@@ -119,11 +119,11 @@ def test_a_likelihood_that_is_no_number_leaves_the_last_model():
 
 def test_smoothed_states_are_the_means_given_the_outputs_that_are_there():
     """States and outputs are one Gaussian vector: its conditional moments are exact."""
-    rng, n, n_y, T = np.random.default_rng(0), 3, 2, 9
+    rng, n, n_y, T = np.random.default_rng(0), 3, 2, 250
     A, B, C = 0.4 * rng.normal(size=(n, n)), rng.normal(size=(n, 1)), rng.normal(size=(n_y, n))
     Q, R, m, P0 = 0.3 * np.eye(n) + 0.1, np.array([[0.5, 0.2], [0.2, 0.4]]), np.ones(n), np.eye(n)
     y, v = rng.normal(size=(T, n_y)), np.ones((T - 1, 1))
-    y[[0, 2, 5, 5, 6], [1, 0, 0, 1, 1]] = np.nan
+    y[[0, 2, 5, 5, 6], [1, 0, 0, 1, 1]] = y[100:170, 0] = np.nan
     found = smooth(Noisy(A, B, C, Q, R, m, P0), groups_of([Signals(y, v)])[0])
     mean, cov = [m], [P0]
     for _ in range(T - 1):
@@ -142,11 +142,12 @@ def test_smoothed_states_are_the_means_given_the_outputs_that_are_there():
     e, K = y.ravel()[seen] - H @ np.concatenate(mean), whole @ H.T @ np.linalg.inv(V)
     exact = (whole - K @ H @ whole).reshape(T, n, T, n)
     x = (np.concatenate(mean) + K @ e).reshape(1, T, n)
-    np.testing.assert_allclose(found.x, x, atol=1e-10)
+    assert len(found.P) < 200, "settled covariances are computed once"
+    np.testing.assert_allclose(found.x, x, atol=1e-7)
     for k in range(T):
-        np.testing.assert_allclose(found.P[k], exact[k, :, k], atol=1e-10)
-    for k in range(T - 1):
-        np.testing.assert_allclose(found.cross[k], exact[k + 1, :, k], atol=1e-10)
+        np.testing.assert_allclose(found.P[found.at[k]], exact[k, :, k], atol=1e-7)
+    cross = sum(exact[k + 1, :, k] for k in range(T - 1))
+    np.testing.assert_allclose(found.cross, cross, atol=1e-7)
     likelihood = -(np.linalg.slogdet(V)[1] + e @ np.linalg.solve(V, e)) / 2
     assert found.likelihood == pytest.approx(likelihood)
 

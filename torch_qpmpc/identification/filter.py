@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_qpmpc.qp.kernels.linalg import compiled
+from torch_qpmpc.qp.kernels.linalg import add_product, compiled, dot
 
 Array = NDArray[Any]
 #: A covariance that changes by less than this share has settled.
@@ -27,14 +27,15 @@ SINGULAR = 1e-12
 
 
 class Course(NamedTuple):
-    """The filter's matrices in each step; those of missing outputs are zero.
+    """The filter's matrices, as often as they change; those of missing outputs are zero.
 
     Attributes:
-        P: the covariances before the outputs, ``(T, n, n)``.
-        K: the gains, ``(T, n, n_y)``.
-        V: the covariances of the innovations, ``(T, n_y, n_y)``.
+        P: the covariances before the outputs, ``(D, n, n)``.
+        K: the gains, ``(D, n, n_y)``.
+        V: the covariances of the innovations, ``(D, n_y, n_y)``.
         inverse: their pseudoinverses.
-        half: half of the logarithms of their determinants, ``(T,)``.
+        half: half of the logarithms of their determinants, ``(D,)``.
+        at: the place of each step's matrices among these, ``(T,)``.
         after: P_T, before the outputs that follow.
     """
 
@@ -43,19 +44,51 @@ class Course(NamedTuple):
     V: Array
     inverse: Array
     half: Array
+    at: Array
     after: Array
 
 
 class Smoothed(NamedTuple):
-    """Means ``(G, T, n)`` given all outputs, their covariances, and neighbours', ``(T - 1, n, n)``.
+    """States given all outputs.
 
-    ``likelihood`` is its logarithm, up to a constant.
+    Attributes:
+        x: means ``(G, T, n)``.
+        P: covariances ``(D, n, n)``, as often as they change.
+        at: the place of each step's covariance among these, ``(T,)``.
+        cross: the sum of neighbours' covariances, ``(n, n)``.
+        likelihood: its logarithm, up to a constant.
     """
 
     x: Array
     P: Array
+    at: Array
     cross: Array
     likelihood: float
+
+    def total(self, steps: Any) -> Array:
+        """Return the sum of the covariances of ``steps``, an index of ``(T,)``."""
+        return np.tensordot(np.bincount(self.at[steps], minlength=len(self.P)), self.P, 1)
+
+
+@compiled
+def product(out, X, Y):
+    """Put X Y into ``out``."""
+    for i in range(X.shape[0]):
+        for j in range(Y.shape[1]):
+            total = 0.0
+            for k in range(X.shape[1]):
+                total += X[i, k] * Y[k, j]
+            out[i, j] = total
+
+
+@compiled
+def near(X, Y, size, share):
+    """True if the entries differ by at most the ``share`` of the roots of two sizes."""
+    for i in range(len(X)):
+        for j in range(len(X)):
+            if abs(X[i, j] - Y[i, j]) > share * np.sqrt(max(size[i] * size[j], 0.0)):
+                return False
+    return True
 
 
 @compiled
@@ -63,161 +96,164 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
     """Return the parts of a `Course` for the outputs ``seen`` ``(T, n_y)``; see above.
 
     L is the gain in directions without variance. A covariance whose entries change by less than the
-    share ``same`` of the states' variances between complete rows stays.
+    share ``same`` of the states' variances stays until other outputs are seen.
     """
-    T, n_y = seen.shape
-    n = len(A)
-    Ps, Ks = np.zeros((T, n, n)), np.zeros((T, n, n_y))
-    Vs, inverses, half = np.zeros((T, n_y, n_y)), np.zeros((T, n_y, n_y)), np.zeros(T)
-    P, X, Y, size_x = P.copy(), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n)
-    places = np.zeros(n_y, np.int64)
-    settled = False
+    (T, n_y), n, d, settled = seen.shape, len(A), -1, False
+    Ps, Ks, at = np.empty((T + 1, n, n)), np.empty((T, n, n_y)), np.empty(T, np.int64)
+    Vs, inverses, half = np.empty((T, n_y, n_y)), np.zeros((T, n_y, n_y)), np.zeros(T)
+    AT, CT, X, Y, size_x = A.T.copy(), C.T.copy(), np.empty((n, n)), np.empty((n, n)), np.empty(n)
+    G, H, KT, size = np.empty((n, n_y)), np.empty((n, n_y)), np.empty((n_y, n)), np.empty(n_y)
+    w, v, scaled = np.ones(n_y), np.eye(n_y), np.eye(n_y)
+    Ps[0] = P
     for t in range(T):
-        m = 0
-        for i in range(n_y):
-            if seen[t, i]:
-                places[m] = i
-                m += 1
-        if settled and m == n_y:
-            Ps[t], Ks[t], Vs[t] = P, Ks[t - 1], Vs[t - 1]
-            inverses[t], half[t] = inverses[t - 1], half[t - 1]
+        for a in range(n_y):
+            settled &= seen[t, a] == seen[t - 1, a]
+        if settled:
+            at[t] = d
             continue
-        G, V = np.zeros((n, m)), np.zeros((m, m))
-        for i in range(n):
-            for b in range(m):
-                total = N[i, places[b]]
-                for j in range(n):
-                    total += P[i, j] * C[places[b], j]
-                G[i, b] = total
-        for a in range(m):
-            for b in range(m):
-                total = R[places[a], places[b]]
-                for j in range(n):
-                    total += C[places[a], j] * (G[j, b] - N[j, places[b]])
-                V[a, b] = total
-        size = np.zeros(m)
-        for a in range(m):
-            size[a] = np.sqrt(max(V[a, a], 0.0))
-        scaled = np.zeros((m, m))
-        for a in range(m):
-            for b in range(m):
-                if size[a] > 0 and size[b] > 0:
-                    scaled[a, b] = (V[a, b] + V[b, a]) / (2 * size[a] * size[b])
-        inverse = np.zeros((m, m))
-        if m == 1:
-            if size[0] > 0:
-                inverse[0, 0] = 1 / V[0, 0]
-                half[t] = np.log(size[0])
-        elif m > 1:
+        d += 1
+        at[t], K, V, inverse = d, Ks[d], Vs[d], inverses[d]
+        product(G, Ps[d], CT)
+        product(V, C, G)
+        for a in range(n_y):
+            for b in range(a + 1):
+                V[a, b] = (V[a, b] + V[b, a] + R[a, b] + R[b, a]) / 2 * seen[t, a] * seen[t, b]
+                V[b, a] = V[a, b]
+            size[a] = np.sqrt(V[a, a]) if V[a, a] > 0 else np.inf
+            half[d] += np.log(size[a]) if V[a, a] > 0 else 0.0
+            for b in range(a):
+                scaled[a, b] = scaled[b, a] = V[a, b] / (size[a] * size[b])
+        if n_y > 1:
             w, v = np.linalg.eigh(scaled)
-            for k in range(m):
-                if w[k] > SINGULAR * w[m - 1]:
-                    half[t] += np.log(w[k]) / 2
-                    for a in range(m):
-                        for b in range(m):
-                            if size[a] > 0 and size[b] > 0:
-                                inverse[a, b] += v[a, k] * v[b, k] / (w[k] * size[a] * size[b])
-            for a in range(m):
-                if size[a] > 0:
-                    half[t] += np.log(size[a])
-        # K = G V^- + L (1 - V V^-)
+        for k in range(n_y):
+            if w[k] > SINGULAR * w[-1]:
+                half[d] += np.log(w[k]) / 2
+                for a in range(n_y):
+                    for b in range(n_y):
+                        inverse[a, b] += v[a, k] * v[b, k] / (w[k] * size[a] * size[b])
+        # K = (P C' + N) V^- + L (1 - V V^-)
         for i in range(n):
-            for b in range(m):
-                total = L[i, places[b]]
-                for a in range(m):
-                    rest = G[i, a]
-                    for c in range(m):
-                        rest -= L[i, places[c]] * V[c, a]
-                    total += rest * inverse[a, b]
-                Ks[t, i, places[b]] = total
-        for a in range(m):
-            for b in range(m):
-                Vs[t, places[a], places[b]] = V[a, b]
-                inverses[t, places[a], places[b]] = inverse[a, b]
-        Ps[t] = P
+            for a in range(n_y):
+                H[i, a] = L[i, a] * seen[t, a]
+        product(K, H, V)
+        for i in range(n):
+            for a in range(n_y):
+                G[i, a] += N[i, a] - K[i, a]
+        product(K, G, inverse)
+        for i in range(n):
+            for a in range(n_y):
+                K[i, a] += H[i, a]
+                KT[a, i] = K[i, a]
+        # A (P + W - K V K') A' + Q
+        product(H, K, V)
+        product(X, H, KT)
+        for i in range(n):
+            size_x[i] = Ps[d, i, i] + W[i, i]
+            for j in range(n):
+                Y[i, j] = Ps[d, i, j] + W[i, j] - X[i, j]
+        product(X, A, Y)
+        product(Y, X, AT)
         for i in range(n):
             for j in range(n):
-                X[i, j] = P[i, j] + W[i, j]
-            for b in range(m):
-                total = 0.0
-                for a in range(m):
-                    total += Ks[t, i, places[a]] * V[a, b]
-                for j in range(n):
-                    X[i, j] -= total * Ks[t, j, places[b]]
-        for i in range(n):
-            for j in range(n):
-                total = 0.0
-                for k in range(n):
-                    total += A[i, k] * X[k, j]
-                Y[i, j] = total
-        for i in range(n):
-            for j in range(n):
-                total = Q[i, j]
-                for k in range(n):
-                    total += Y[i, k] * A[j, k]
-                X[i, j] = total
-        settled = m == n_y
-        for i in range(n):
-            size_x[i] = np.sqrt(max(P[i, i] + W[i, i], 0.0))
-        for i in range(n):
-            for j in range(n):
-                Y[i, j] = (X[i, j] + X[j, i]) / 2
-                if abs(Y[i, j] - P[i, j]) > same * size_x[i] * size_x[j]:
-                    settled = False
-        P[:] = Y
-    return Ps, Ks, Vs, inverses, half, P
+                Ps[d + 1, i, j] = (Y[i, j] + Y[j, i] + Q[i, j] + Q[j, i]) / 2
+        settled = near(Ps[d + 1], Ps[d], size_x, same)
+    return Ps[: d + 1], Ks[: d + 1], Vs[: d + 1], inverses[: d + 1], half[: d + 1], at, Ps[d + 1]
 
 
 @compiled
-def filtered(A, C, K, y, moved, x):
-    """Return the predictions ``(T, G, n)`` of states and the innovations, zero where missing.
+def filtered(A, C, K, at, y, moved, x):
+    """Return the states before and after the outputs ``(T, G, n)`` and the innovations.
+
+    These are zero where outputs are missing.
 
     Args:
         A, C: the model.
-        K: the gains of each step, ``(T, n, n_y)``.
+        K, at: the gains, and the place of each step's among them.
         y: outputs ``(T, G, n_y)``, NaN where they are missing.
         moved: B u + .. of the steps, ``(T - 1, G, n)``.
         x: the first states' mean ``(n,)``.
     """
-    T, G, n_y = y.shape
-    n = len(A)
-    prior, e, z = np.empty((T, G, n)), np.zeros((T, G, n_y)), np.empty(n)
-    for g in range(G):
-        prior[0, g] = x
+    (T, G, n_y), n = y.shape, len(A)
+    prior, after, e = np.empty((T, G, n)), np.zeros((T, G, n)), np.zeros((T, G, n_y))
     for t in range(T):
         for g in range(G):
+            before, now, L = prior[t, g], after[t, g], K[at[t]]
+            for i in range(n):
+                before[i] = dot(A[i], after[t - 1, g]) + moved[t - 1, g, i] if t else x[i]
             for a in range(n_y):
                 if not np.isnan(y[t, g, a]):
-                    e[t, g, a] = y[t, g, a]
-                    for i in range(n):
-                        e[t, g, a] -= C[a, i] * prior[t, g, i]
+                    e[t, g, a] = y[t, g, a] - dot(C[a], before)
             for i in range(n):
-                z[i] = prior[t, g, i]
-                for a in range(n_y):
-                    z[i] += K[t, i, a] * e[t, g, a]
-            for i in range(n if t + 1 < T else 0):
-                total = moved[t, g, i]
-                for j in range(n):
-                    total += A[i, j] * z[j]
-                prior[t + 1, g, i] = total
-    return prior, e
+                now[i] = before[i] + dot(L[i], e[t, g])
+    return prior, after, e
 
 
 def smoothed(A: Array, C: Array, run: Course, prior: Array, e: Array) -> Smoothed:
     """Return the smoothed states of white noise, by the recursion of Bryson and Frazier."""
-    weighted = applied(run.inverse, e)
-    likelihood = -run.half.sum() * e.shape[1] - (weighted * e).sum() / 2
-    F, CV = A - A @ run.K @ C, C.T @ run.inverse
-    back, own = applied(CV, e), CV @ C
-    turned = F.swapaxes(-1, -2)
-    # r_{t-1} = C' V^-1 e_t + F_t' r_t, from r_{T-1} = 0
-    zero = np.zeros_like(back[0])
-    r = recursion(turned[::-1].copy(), back[::-1].copy(), zero)[::-1]
-    N = spread(turned.copy(), own.copy(), np.zeros_like(own[0]))
-    P = run.P - run.P @ N[:-1] @ run.P
-    cross = (np.eye(len(A)) - run.P[1:] @ N[1:-1]) @ F[:-1] @ run.P[:-1]
-    x = prior + applied(run.P, r[:-1])
-    return Smoothed(np.moveaxis(x, 0, 1), P, cross, float(likelihood))
+    at, F = run.at, A - A @ run.K @ C
+    x, size = smoothed_means(run.P, F, C, run.inverse, at, prior, e)
+    N, back = spread(F, C.T @ run.inverse @ C, at, SAME)
+    first, place = changes(at, back[:-1])
+    P, N_first = run.P[at[first]], N[back[first]]
+    P = P - P @ N_first @ P
+    k, steps = changes(at[:-1], at[1:], back[1:-1])
+    cross = run.P[at[k + 1]] @ N[back[k + 1]]
+    cross = (np.eye(len(A)) - cross) @ F[at[k]] @ run.P[at[k]]
+    likelihood = -run.half[at].sum() * e.shape[1] - size / 2
+    return Smoothed(x, P, place, np.tensordot(np.bincount(steps), cross, 1), float(likelihood))
+
+
+def changes(*places: Array) -> tuple[Array, Array]:
+    """Return the steps at which places change, and the number of changes before each step."""
+    new = np.any([np.diff(x, prepend=-1) != 0 for x in places], 0)
+    return np.flatnonzero(new), np.cumsum(new) - 1
+
+
+@compiled
+def smoothed_means(P, F, C, inverse, at, prior, e):
+    """Return x_t = prior_t + P_t r_t ``(G, T, n)`` and the sum of e' V^-1 e.
+
+    r_t = C' V^-1 e_t + F_t' r_{t+1}, from zero after the end.
+    """
+    T, G, n = prior.shape
+    x, r, w, total = np.empty((G, T, n)), np.zeros((G, n)), np.empty(e.shape[2]), 0.0
+    for t in range(T - 1, -1, -1):
+        for g in range(G):
+            z = x[g, t]
+            w[:] = z[:] = 0.0
+            add_product(w, e[t, g], inverse[at[t]])
+            add_product(z, w, C)
+            add_product(z, r[g], F[at[t]])
+            total += dot(w, e[t, g])
+            r[g], z[:] = z, prior[t, g]
+            add_product(z, r[g], P[at[t]])
+    return x, total
+
+
+@compiled
+def spread(F, own, at, same):
+    """Return N_t = own_t + F_t' N_{t+1} F_t from zero, as often as it changes, and places.
+
+    One that changes by less than the share ``same`` between steps of equal matrices stays.
+    """
+    T, (_, n, _) = len(at), own.shape
+    N, back, half = np.zeros((T + 1, n, n)), np.zeros(T + 1, np.int64), np.empty((n, n))
+    d, settled, FT, size = 0, False, np.empty((n, n)), np.empty(n)
+    for t in range(T - 1, -1, -1):
+        if not settled or at[t] != at[t + 1]:
+            k, d = at[t], d + 1
+            for i in range(n):
+                for j in range(n):
+                    FT[i, j] = F[k, j, i]
+            product(half, FT, N[d - 1])
+            product(N[d], half, F[k])
+            for i in range(n):
+                for j in range(n):
+                    N[d, i, j] += own[k, i, j]
+                size[i] = N[d, i, i]
+            settled = near(N[d], N[d - 1], size, same)
+        back[t] = d
+    return N[: d + 1], back
 
 
 def alike(seen: Array) -> list[list[int]]:
@@ -226,45 +262,3 @@ def alike(seen: Array) -> list[list[int]]:
     for i, one in enumerate(seen):
         groups.setdefault(one.tobytes(), []).append(i)
     return list(groups.values())
-
-
-def applied(M: Array, x: Array) -> Array:
-    """Return the products of x ``(T, G, n)`` with the matrices of each step ``(T, .., n)``."""
-    return np.matmul(x, M.swapaxes(-1, -2))
-
-
-@compiled
-def recursion(M, c, z):
-    """Return z_0 = z and z_{t+1} = M_t z_t + c_t, ``(T + 1, G, n)``."""
-    T, G, n = c.shape
-    out = np.empty((T + 1, G, n))
-    out[0] = z
-    for t in range(T):
-        for i in range(G):
-            for j in range(n):
-                total = c[t, i, j]
-                for k in range(n):
-                    total += M[t, j, k] * out[t, i, k]
-                out[t + 1, i, j] = total
-    return out
-
-
-@compiled
-def spread(J, own, last):
-    """Return P_T = last and P_t = J_t P_{t+1} J_t' + own_t, ``(T + 1, n, n)``."""
-    T, n, _ = own.shape
-    out, half = np.empty((T + 1, n, n)), np.empty((n, n))
-    out[T] = last
-    for t in range(T - 1, -1, -1):
-        for j in range(n):
-            for k in range(n):
-                half[j, k] = 0.0
-                for m in range(n):
-                    half[j, k] += J[t, j, m] * out[t + 1, m, k]
-        for j in range(n):
-            for k in range(n):
-                total = own[t, j, k]
-                for m in range(n):
-                    total += half[j, m] * J[t, k, m]
-                out[t, j, k] = total
-    return out

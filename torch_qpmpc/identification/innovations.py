@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.identification.filter import Array, Course, alike, applied, course, filtered
+from torch_qpmpc.identification.filter import Array, Course, alike, course, filtered
 
 #: A gain that differs from the steady one by less than this share has settled.
 SETTLED = 1e-9
@@ -96,9 +96,8 @@ class Innovations(NamedTuple):
         for rows in alike(seen):
             run = self.course(seen[rows[0]])
             signals = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
-            parts = map(np.ascontiguousarray, (self.A, self.C, run.K, *signals, self.x0))
-            prior, e = filtered(*parts)
-            xi[rows] = np.moveaxis(prior + applied(run.K, e), 0, 1)
+            parts = map(np.ascontiguousarray, (self.A, self.C, run.K, run.at, *signals, self.x0))
+            xi[rows] = np.moveaxis(filtered(*parts)[1], 0, 1)
         return xi.reshape(*batch, -1, n)
 
     def inputs(self, u: Array, d: Array) -> Array:

@@ -90,7 +90,7 @@ def smooth(par: Noisy, group: Group) -> Smoothed:
     parts = map(np.ascontiguousarray, (A, C, none, zero, Q, R, zero, P))
     run = Course(*course(*parts, group.kinds[group.kind], SAME))
     signals = (np.moveaxis(x, 0, 1) for x in (group.y, group.v @ B.T))
-    prior, e = filtered(*map(np.ascontiguousarray, (A, C, run.K, *signals, m)))
+    prior, _, e = filtered(*map(np.ascontiguousarray, (A, C, run.K, run.at, *signals, m)))
     return smoothed(A, C, run, prior, e)
 
 
@@ -120,28 +120,28 @@ def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
     Sx1 = S11 = Szz
     Sxx, Syx = np.zeros((n_y, n, n)), np.zeros((n_y, n))
     N = 0
-    for (y, v, kinds, kind, _), (x, P, cross, _) in zip(groups, moments, strict=True):
-        G = len(y)
+    for (y, v, kinds, kind, _), one in zip(groups, moments, strict=True):
+        x, G = one.x, len(y)
         z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
         x1 = x[:, 1:].reshape(-1, n)
         zz, xz = z.T @ z, x1.T @ z
-        zz[:n, :n] += G * P[:-1].sum(0)
-        xz[:, :n] += G * cross.sum(0)
-        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * P[1:].sum(0)
+        zz[:n, :n] += G * one.total(slice(-1))
+        xz[:, :n] += G * one.cross
+        Szz, Sx1, S11 = Szz + zz, Sx1 + xz, S11 + x1.T @ x1 + G * one.total(slice(1, None))
         for i, seen in enumerate(kinds):
             xs, ys = x[:, kind == i].reshape(-1, n), y[:, kind == i].reshape(-1, n_y)
-            xx = xs.T @ xs + G * P[kind == i].sum(0)
+            xx = xs.T @ xs + G * one.total(kind == i)
             Sxx[seen] += xx
             Syx[seen] += ys[:, seen].T @ xs
         N = N + len(x1)
     AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
     C = np.stack([np.linalg.solve(_lifted(xx), yx) for xx, yx in zip(Sxx, Syx, strict=True)])
     RR, M = np.zeros((n_y, n_y)), np.zeros((n_y, n_y))
-    for (y, _, kinds, kind, _), (x, P, *_) in zip(groups, moments, strict=True):
-        e = np.where(np.isnan(y), 0.0, y - x @ C.T)
+    for (y, _, kinds, kind, _), one in zip(groups, moments, strict=True):
+        e = np.where(np.isnan(y), 0.0, y - one.x @ C.T)
         for i, seen in enumerate(kinds):
             both, rows = np.outer(seen, seen), e[:, kind == i].reshape(-1, n_y)
-            RR += both * (rows.T @ rows + len(y) * C @ P[kind == i].sum(0) @ C.T)
+            RR += both * (rows.T @ rows + len(y) * C @ one.total(kind == i) @ C.T)
             M += both * len(rows)
     Q = _positive((S11 - AB @ Sx1.T) / N, FLOOR_Q)
     R = _positive(RR / np.maximum(M, 1), FLOOR_R)
