@@ -108,12 +108,44 @@ def test_missing_outputs_cost_only_their_information(kind):
     assert "outputs missing" in str(found)
 
 
-def test_a_likelihood_that_is_no_number_leaves_the_last_model():
-    y, one = np.random.default_rng(0).normal(size=(20, 1)), np.eye(1)
-    start = Noisy(0.5 * one, one, one, one, one, np.zeros(1), one)
-    data = [Signals(y, np.ones((19, 1)))]
+def likelihood(par: Noisy, data: list[Signals]) -> float:
+    return sum(smooth(par, group).likelihood for group in groups_of(data))
+
+
+def test_longer_steps_raise_the_likelihood_faster():
+    rng, A, x = np.random.default_rng(2), np.array([[0.95, 0.2], [-0.2, 0.95]]), np.zeros(2)
+    y, u = np.zeros((300, 1)), rng.normal(size=(299, 1))
+    for k in range(300):
+        y[k] = x[0] + 1e-3 * rng.normal()
+        x = A @ x + ([0.0, 1.0] * u[k] if k < 299 else 0) + 0.1 * rng.normal(size=2)
+    data, rest = [Signals(y, u)], (np.eye(1, 2), np.eye(2), np.eye(1), np.zeros(2), np.eye(2))
+    start = Noisy(0.7 * A, np.ones((2, 1)), *rest)
+    values = [likelihood(em(start, data, count, 1.2), data) for count in (0, 5, 10, 20, 30)]
+    assert np.all(np.diff(values) > 0)
+    assert values[-1] > likelihood(em(start, data, 30), data) + 4
+
+
+def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken(monkeypatch):
+    """One of two states, of a plant with three: the likeliest is right one step ahead."""
+    rng, x, A = np.random.default_rng(0), np.zeros(3), scipy.linalg.block_diag(np.eye(2), 0.6)
+    A[:2] = [[0.98, 0.1, 0], [-0.1, 0.95, 0.1]]
+    y, u = np.zeros((501, 1)), rng.uniform(-1, 1, (500, 1))
+    for k in range(501):
+        y[k] = x[0] + 1e-3 * rng.normal()
+        x = A @ x + [0, 0.2, 1] * u[min(k, 499)] + [0, 0, 0.03] * rng.normal(size=3)
+    log = {"y": y, "u": u}
+    found = qm.identify(log, order=2)
+    monkeypatch.setattr(subspace, "MANY", 0)
+    assert off(found, log) < 1.02 * off(qm.identify(log, order=2), log)
+
+
+@pytest.mark.parametrize("n_y", [1, 2])
+def test_a_likelihood_that_is_no_number_leaves_the_last_model(n_y):
+    y, one = np.random.default_rng(0).normal(size=(20, n_y)), np.eye(n_y)
+    B, rest = np.ones((n_y, 1)), (one, one, one, np.zeros(n_y), one)
+    start, data = Noisy(0.5 * one, B, *rest), [Signals(y, np.ones((19, 1)))]
     assert np.isfinite(em(start, data, 3).A).all()
-    broken = start._replace(A=np.full((1, 1), np.nan))
+    broken = start._replace(A=np.full((n_y, n_y), np.nan))
     assert em(broken, data, 3) is broken
 
 

@@ -83,10 +83,10 @@ def product(out, X, Y):
 
 @compiled
 def near(X, Y, size, share):
-    """True if the entries differ by at most the ``share`` of the roots of two sizes."""
+    """True if entries differ by at most the ``share`` of what a covariance ``size`` allows."""
     for i in range(len(X)):
         for j in range(len(X)):
-            if abs(X[i, j] - Y[i, j]) > share * np.sqrt(max(size[i] * size[j], 0.0)):
+            if abs(X[i, j] - Y[i, j]) > share * np.sqrt(max(size[i, i] * size[j, j], 0.0)):
                 return False
     return True
 
@@ -101,8 +101,8 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
     (T, n_y), n, d, settled = seen.shape, len(A), -1, False
     Ps, Ks, at = np.empty((T + 1, n, n)), np.empty((T, n, n_y)), np.empty(T, np.int64)
     Vs, inverses, half = np.empty((T, n_y, n_y)), np.zeros((T, n_y, n_y)), np.zeros(T)
-    AT, CT, X, Y, size_x = A.T.copy(), C.T.copy(), np.empty((n, n)), np.empty((n, n)), np.empty(n)
-    G, H, KT, size = np.empty((n, n_y)), np.empty((n, n_y)), np.empty((n_y, n)), np.empty(n_y)
+    AT, CT, X, Y = A.T.copy(), C.T.copy(), np.empty((n, n)), np.empty((n, n))
+    G, H, now, size = np.empty((n, n_y)), np.empty((n, n_y)), np.empty((n, n)), np.empty(n_y)
     w, v, scaled = np.ones(n_y), np.eye(n_y), np.eye(n_y)
     Ps[0] = P
     for t in range(T):
@@ -122,7 +122,8 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
             size[a] = np.sqrt(V[a, a]) if V[a, a] > 0 else np.inf
             half[d] += np.log(size[a]) if V[a, a] > 0 else 0.0
             for b in range(a):
-                scaled[a, b] = scaled[b, a] = V[a, b] / (size[a] * size[b])
+                part = V[a, b] / (size[a] * size[b])
+                scaled[a, b] = scaled[b, a] = part if abs(part) < 2 else 0.0  # NaN
         if n_y > 1:
             w, v = np.linalg.eigh(scaled)
         for k in range(n_y):
@@ -132,31 +133,20 @@ def course(A, C, W, N, Q, R, L, P, seen, same):
                     for b in range(n_y):
                         inverse[a, b] += v[a, k] * v[b, k] / (w[k] * size[a] * size[b])
         # K = (P C' + N) V^- + L (1 - V V^-)
-        for i in range(n):
-            for a in range(n_y):
-                H[i, a] = L[i, a] * seen[t, a]
+        H[:] = L * seen[t]
         product(K, H, V)
-        for i in range(n):
-            for a in range(n_y):
-                G[i, a] += N[i, a] - K[i, a]
+        G += N - K
         product(K, G, inverse)
-        for i in range(n):
-            for a in range(n_y):
-                K[i, a] += H[i, a]
-                KT[a, i] = K[i, a]
+        K += H
         # A (P + W - K V K') A' + Q
         product(H, K, V)
-        product(X, H, KT)
-        for i in range(n):
-            size_x[i] = Ps[d, i, i] + W[i, i]
-            for j in range(n):
-                Y[i, j] = Ps[d, i, j] + W[i, j] - X[i, j]
-        product(X, A, Y)
-        product(Y, X, AT)
-        for i in range(n):
-            for j in range(n):
-                Ps[d + 1, i, j] = (Y[i, j] + Y[j, i] + Q[i, j] + Q[j, i]) / 2
-        settled = near(Ps[d + 1], Ps[d], size_x, same)
+        product(X, H, K.T.copy())
+        now[:] = Ps[d] + W
+        product(Y, A, now - X)
+        product(X, Y, AT)
+        X += Q
+        Ps[d + 1] = (X + X.T) / 2
+        settled = near(Ps[d + 1], Ps[d], now, same)
     return Ps[: d + 1], Ks[: d + 1], Vs[: d + 1], inverses[: d + 1], half[: d + 1], at, Ps[d + 1]
 
 
@@ -238,20 +228,14 @@ def spread(F, own, at, same):
     """
     T, (_, n, _) = len(at), own.shape
     N, back, half = np.zeros((T + 1, n, n)), np.zeros(T + 1, np.int64), np.empty((n, n))
-    d, settled, FT, size = 0, False, np.empty((n, n)), np.empty(n)
+    d, settled = 0, False
     for t in range(T - 1, -1, -1):
         if not settled or at[t] != at[t + 1]:
             k, d = at[t], d + 1
-            for i in range(n):
-                for j in range(n):
-                    FT[i, j] = F[k, j, i]
-            product(half, FT, N[d - 1])
+            product(half, F[k].T.copy(), N[d - 1])
             product(N[d], half, F[k])
-            for i in range(n):
-                for j in range(n):
-                    N[d, i, j] += own[k, i, j]
-                size[i] = N[d, i, i]
-            settled = near(N[d], N[d - 1], size, same)
+            N[d] += own[k]
+            settled = near(N[d], N[d - 1], N[d], same)
         back[t] = d
     return N[: d + 1], back
 

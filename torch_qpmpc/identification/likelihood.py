@@ -22,7 +22,7 @@ from torch_qpmpc.identification.filter import (
 from torch_qpmpc.identification.innovations import Innovations
 
 #: The gain of the log-likelihood per step that ends expectation maximisation.
-STALLED = 1e-5
+STALLED = 1e-4
 #: The least variances of the noise of normalised states and outputs.
 FLOOR_Q, FLOOR_R = 1e-12, 1e-8
 
@@ -94,19 +94,30 @@ def smooth(par: Noisy, group: Group) -> Smoothed:
     return smoothed(A, C, run, prior, e)
 
 
-def em(par: Noisy, data: Sequence[Signals], iterations: int) -> Noisy:
-    """Raise the likelihood by expectation maximisation."""
-    groups, before, last = groups_of(data), -np.inf, par
-    steps = sum(len(y) for y, _ in data)
+@np.errstate(over="ignore", invalid="ignore")  # of leaps that diverge
+def em(par: Noisy, data: Sequence[Signals], iterations: int, growth: float = 1.0) -> Noisy:
+    """Raise the likelihood by expectation maximisation.
+
+    With a ``growth`` above 1, steps are lengthened by a factor that grows so in each (Salakhutdinov
+    and Roweis 2003); from one that lowers the likelihood it returns, and the factor is 1 again.
+    """
+    groups, steps = groups_of(data), sum(len(y) for y, _ in data)
+    before, last, plain, factor = -np.inf, par, par, 1.0
     for _ in range(iterations):
         moments = [smooth(par, group) for group in groups]
         value = sum(m.likelihood for m in moments) / steps
-        if not np.isfinite(value):
-            return last
-        if value - before < STALLED:
-            break
-        before, last, par = value, par, _maximise(groups, moments)
-    return par
+        if par is not plain and not value >= before + STALLED:
+            par, factor = plain, 1.0
+            continue
+        if not value - before >= STALLED:
+            return plain if np.isfinite(value) else last
+        before, last, plain = value, par, _maximise(groups, moments)
+        factor, par = factor * growth, plain
+        if factor > 1:
+            far = Noisy(*(x + factor * (z - x) for x, z in zip(last, plain, strict=True)))
+            parts = {"Q": FLOOR_Q, "R": FLOOR_R, "P0": FLOOR_Q}
+            par = far._replace(**{k: _positive(getattr(far, k), w) for k, w in parts.items()})
+    return plain
 
 
 def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:

@@ -33,8 +33,9 @@ from torch_qpmpc.identification.likelihood import (
 from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.ridge import ridge
 
-#: Iterations of expectation maximisation, of a candidate and of the fit.
-FEW, MANY = 5, 10
+#: Iterations of expectation maximisation, of a candidate and of the fit; and the further ones, of
+#: steps that grow by a factor, of a fit that predicts the last horizon as well with them.
+FEW, SOME, MANY, GROWTH = 5, 10, 200, 1.2
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
@@ -120,8 +121,11 @@ def fit_state_space(
         parts = [readable(x, data) if order else x for x in found[rows.index(best)][1]]
     model = measured(data, filled)
     if order:
-        par = em(_states(_predictor(filled, lags), order), data, MANY)
-        model = readable(steady(par), data)
+        par = em(_states(_predictor(filled, lags), order), data, SOME)
+        likely, held = em(par, data, MANY, GROWTH), _Held(trajectories)
+        some, many = map(steady, (par, likely))
+        far = [_far(one, data, held) for one in (some, many)]
+        model = readable(many if far[1] <= far[0] else some, data)
     return Fit(
         normal.restore(model), order or 0, lags, tuple(rows), tuple(map(normal.restore, parts))
     )
@@ -328,6 +332,12 @@ def _score(total: Array, count: Array) -> float:
     """Return the mean logarithm of the outputs' mean squared errors of all horizons."""
     mse = (total / np.maximum(count, 1)).sum(0) / np.maximum((count > 0).sum(0), 1)
     return float(np.log(np.maximum(mse[count.any(0)], EXACT)).mean())
+
+
+def _far(model: Innovations, data: Sequence[Signals], held: _Held) -> float:
+    """Return the score of the predictions over the last horizon."""
+    sums = _sums([model] * PARTS, data, held.count, held.targets(HORIZONS)).sum(1)
+    return _score(*sums[:, np.flatnonzero(sums[1].any(1))[-1:]])
 
 
 def equal_candidates(rows: Sequence[Candidate]) -> list[Candidate]:
