@@ -8,6 +8,7 @@ import qpsolvers
 import scipy.linalg
 
 import torch_qpmpc as qm
+from torch_qpmpc.export.tables import make_tables
 
 
 def drawn(seed: int) -> qm.LinearMPC:
@@ -128,3 +129,12 @@ def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target():
     u = target.u.numpy().ravel()
     assert u.min() < -1
     assert abs(u @ [1.0, 0.5] + mpc.design.disturbances.B[0] @ np.full(1, 5.0)) < 1e-6
+
+
+def test_rounding_beside_outputs_of_large_numbers_sets_no_length():
+    """An integrator and a lag, each with an output: the basis of the steady states is dense."""
+    B, C = np.random.default_rng(0).normal(size=(2, 3)), np.diag([1e2, 1e6])
+    weights = {"Q": [1e-4, 1e-12], "dR": 1.0, "u_bounds": (-1.0, 2.0)}
+    bounds = {"y_bounds": {"y2": (-1e6, 1e6)}}
+    mpc = qm.LinearMPC((np.diag([1.0, 0.6]), B, C), 4, **weights, **bounds)
+    assert make_tables(mpc.targets).condition < 1e3

@@ -21,7 +21,7 @@ def test_rows_have_unit_norm_and_depend_on_the_variables_only(seed):
 
 def test_a_cost_that_is_singular_on_the_plan_is_refused():
     mpc = drawn_mpc(1, 2, 3, B=[[1.0, 1.0]], stage_weight=[1.0, 0.0, 0.0])
-    match = r"H: got eigenvalues from .*, expected a cost that is positive definite.*Add a small"
+    match = r"H: got eigenvalues from .*, expected a cost that is positive definite.*Give the"
     with pytest.raises(QPError, match=match):
         make_tables(mpc)
 

@@ -91,6 +91,27 @@ def enumerated(
     return cost.min(), u[cost.argmin()]
 
 
+@pytest.mark.parametrize("size", [1e-5, 1e5])
+def test_units_of_actions_decide_no_level(size):
+    """H is nearly singular in these units: curvature for one action would drown the other's."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        B, s = rng.normal(size=(2, 2)), torch.from_numpy(2 * rng.normal(size=2))
+        values = []
+        for unit in (1.0, size):
+            mpc = qm.QPMPC.from_model(
+                0.9 * np.eye(2) + 0.1 * np.eye(2, k=1),
+                B / [1.0, unit],
+                N,
+                stage_weight=np.array([1.0, 1.0, 0.1, 0.1 / unit**2]),
+                action_bounds=([-np.inf, -2 * unit], [np.inf, unit]),
+                action_levels=[(-1.0, 0.0, 1.0), None],
+                start_cost=0.2,
+            )
+            values.append(mpc.value(s).item())
+        assert values[1] == pytest.approx(values[0], rel=1e-7)
+
+
 @pytest.mark.parametrize("seed", range(24))
 def test_value_and_policy_equal_enumeration(seed):
     mpc, s = drawn(seed, most=5000)

@@ -32,6 +32,8 @@ from torch_qpmpc.errors import QPError
 
 #: A singular value below this fraction of the largest is zero.
 RANK = 1e-9
+#: Entries of a column that are this small relative to its largest are what rounding leaves of zero.
+ROUNDING = 1e-14
 #: Weighted outputs whose responses differ by a smaller part of them are one.
 FLAT = RANK**0.5
 #: Sizes that differ by a smaller part of them are equal.
@@ -244,12 +246,12 @@ class Steady:
             x, y, u = (of + basis @ F @ least @ off for of, basis in ((x, X), (y, Y), (u, U)))
             X, U, Y = X @ T, U @ T, Y @ T
             Y[:, -len(W) :][np.abs(Y[:, -len(W) :]) < RANK] = 0.0
-            U[np.abs(U) < RANK] = 0.0  # rounding would set the lengths of the target's QP
-        X, x, U, u, Y, y = (
-            size[:, None] * part
-            for size, parts in ((sizes.x, (X, x)), (sizes.u, (U, u)), (sizes.y, (Y, y)))
-            for part in parts
-        )
+            U[np.abs(U) < RANK] = 0.0
+        size = np.concatenate((sizes.x, sizes.u, sizes.y))[:, None]
+        maps = np.vstack((X, U, Y)), np.vstack((x, u, y))
+        for part in maps:  # rounding would set the lengths of the target's QP
+            part[np.abs(part) < ROUNDING * np.abs(part).max(0)] = 0.0
+        (X, U, Y), (x, u, y) = (np.split(size * part, (n, n + m)) for part in maps)
         y = y + np.hstack((w.C, np.zeros((len(w.C), n_d + 1))))
         return cls(X, U, Y, x, u, y, W)
 

@@ -206,31 +206,32 @@ class Levels:
         self, programs: Programs, runs: np.ndarray, hint: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """Return places of the levels, active sets, costs of starts, outcomes, nodes and gaps."""
-        prepared, n_f, theta = programs.prepared, programs.n_f, programs.theta
-        group, qps = programs.group, programs.reduced_qps()
+        n_f, theta, own = programs.n_f, programs.theta, programs.scaled()
+        prepared, group, qps = own.prepared, own.group, own.reduced_qps()
         of, least = prepared.reduced(n_f).rows, 0.0
+        root, of_rows = np.ones((1, 1)), np.ones((1, theta.G.shape[1]))
+        if (units := programs.prepared.units) is not None:
+            root, of_rows = np.sqrt(units.cost), units.rows
         if prepared.sizes(n_f).shift.any() and (slope := np.abs(qps.g).max(initial=0.0)) > 0:
             # A power of two, as each is kept.
-            least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / np.abs(self.values).max()))
+            size = (np.abs(self.values).max(-1)[:, None] / of_rows[0, self.rows]).max()
+            least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / size))
         K, unit, _, to_free = prepared.dual(n_f, float(least))
-        scale = unit[group]
-        lb, ub = theta.lb[:, of], theta.ub[:, of]
+        scale, unit = unit[group], unit * of_rows[:, of] / root  # the latter in all original units
+        lb, ub = prepared.theta.lb[:, of], prepared.theta.ub[:, of]
         with np.errstate(invalid="ignore"):
-            shift = np.where(
-                np.isfinite(lb), lb - qps.l, np.where(np.isfinite(ub), ub - qps.u, 0.0)
-            )
+            shift = np.nan_to_num(np.where(np.isfinite(lb), lb - qps.l, ub - qps.u))
         free = shift / scale - np.einsum("bij,bj->bi", to_free[group], qps.g)
-        lower, upper, w = lb / scale, ub / scale, qps.w * scale
+        parts = free, lb / scale, ub / scale, qps.w * scale
+        free, lower, upper, w = (root[group] * x for x in parts)
         place = np.full(theta.G.shape[1], -1)
         place[of] = np.arange(len(of))
         rows = place[self.rows]
         given = self.rows[rows < 0]  # those of u_0 in Q, whose level is known
-        known = np.einsum("bri,bi->br", theta.G[group][:, given, :n_f], programs.fixed)
+        known = np.einsum("bri,bi->br", theta.G[programs.group][:, given, :n_f], programs.fixed)
         span = np.ptp(self.values, axis=-1)
         near = ON_LEVEL * np.where(span > 0, span, np.abs(self.values[:, 0]))[(rows < 0).any(-1)]
-        lb, ub = (
-            np.array(np.broadcast_to(x, (len(group), x.shape[1]))) for x in (theta.lb, theta.ub)
-        )
+        lb, ub = (np.tile(x, (len(group) // len(x), 1)) for x in (theta.lb, theta.ub))
         lb[:, given], ub[:, given] = known - near, known + near
         first, last = self.within(lb, ub)
         places, lam, costs, outcomes, nodes, gaps = kernel.search(
