@@ -130,6 +130,7 @@ SHORT = {
     "python -m tests.benchmarks.outside --seeds 16 17 18 19 20": Short(
         "--plants psm --seeds 71", needs=("controlgym",)
     ),
+    "python -m tests.benchmarks.nonlinear": Short("--plants Unicycle --seeds 71"),
     "python -m tests.benchmarks.guide --seeds 16 17 18 19 20 --write": Short(
         "--seeds 71", needs=("controlgym",)
     ),

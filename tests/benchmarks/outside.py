@@ -7,11 +7,11 @@ Each plant is a Gymnasium id, with a shim where its package has none, and its st
 Beside it are zero action and a reference that knows the plant, in the same episodes, which chose
 nothing. The packages are optional:
 
-    pip install 'gymnasium[mujoco,box2d]' pcgym gym-electric-motor anesthesim
+    pip install 'gymnasium[mujoco]' pcgym
     pip install --no-deps controlgym building-energy-storage-simulation 'setuptools<81'
 
-Finished rows are kept in docs/results/outside.csv and not repeated; ``--learn`` adds to them what
-learning by the default of the command reaches. The tables go into docs/results/outside.md.
+Finished rows are kept in docs/results/outside.csv and not repeated; the table goes into
+docs/results/outside.md.
 """
 
 from __future__ import annotations
@@ -35,11 +35,9 @@ import pandas as pd
 import torch
 from scipy.optimize import linprog
 
-import train
 from tests.benchmarks import plants
 from tests.benchmarks.table import DOCS
 from tests.runs import compose_config
-from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import LINEAR
 from torch_qpmpc.experiment.config import Config
@@ -57,7 +55,7 @@ SEEDS, EVAL_SEED = (1, 2, 3), 9002
 #: Rows of the table: a cost that is above zero action's by more than this many standard errors.
 ERRORS = 2.0
 FIELDS = ("plant", "seed", "zero", "random", "start", "excess", "error", "chosen", "R2_cost")
-FIELDS += ("order", "reference", "learned", "transitions", "choosing", "simulated", "seconds")
+FIELDS += ("order", "reference", "transitions", "choosing", "seconds")
 #: The module that `gymnasium.make` imports for an id of a shim.
 HERE = "tests.benchmarks.outside"
 
@@ -106,21 +104,6 @@ PCGYM: dict[str, dict[str, Any]] = {
         "a_space": {"low": np.array([5.0, 10.0]), "high": np.array([500.0, 1000.0])},
         "x0": np.array([0.55, 0.3, 0.45, 0.25, 0.4, 0.20, 0.35, 0.15, 0.25, 0.1, 0.3]),
     },
-    "heat_exchanger": {
-        "N": 60,
-        "tsim": 10,
-        "SP": {"Tt8": [320.0] * 60},
-        "r_scale": {"Tt8": 0.01},
-        "o_space": {
-            "low": np.array([*[280.0] * 24, 300.0]),
-            "high": np.array([*[400.0] * 24, 360.0]),
-        },
-        "a_space": {
-            "low": np.array([0.5, 0.5, 340.0, 300.0]),
-            "high": np.array([5.0, 5.0, 360.0, 320.0]),
-        },
-        "x0": np.array([*[350.0, 340.0, 310.0] * 8, 320.0]),
-    },
     "nonsmooth_control": {
         "N": 60,
         "tsim": 5,
@@ -137,23 +120,7 @@ def pcgym_parameters(model: str) -> dict[str, Any]:
     common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
     own = PCGYM[model]
     common |= {"r_scale": dict.fromkeys(own["SP"], 1e3), "integration_method": "casadi"}
-    if model == "heat_exchanger":  # make_env cannot make it by its name
-        own = {**own, "custom_model": HeatExchanger()}
     return {**common, **own, "model": model}
-
-
-class HeatExchanger:
-    """pcgym's heat exchanger, which unpacks what CasADi does not let it unpack."""
-
-    int_method = "casadi"
-
-    def __init__(self) -> None:
-        self.model = import_module("pcgym.model_classes").heat_exchanger()
-        self.info = self.model.info
-
-    def __call__(self, x: Any, u: Any) -> Any:
-        split = import_module("casadi").vertsplit
-        return self.model(split(x), split(u))
 
 
 class PcGym(gymnasium.Wrapper):
@@ -303,23 +270,6 @@ def battery_plans() -> float:
     return float(np.mean(costs))
 
 
-PROPOFOL = "anesthesim:anesthesim/PropofolControl-v0"
-
-
-def propofol_rule() -> float:
-    """Return J of anesthesim's proportional rule for propofol."""
-    rules = import_module("anesthesim.agents.heuristic").HEURISTIC_MAP
-    rule = rules[PROPOFOL.rpartition(":")[2]]
-    env = gymnasium.make(PROPOFOL, max_episode_steps=GymnasiumPlant(PROPOFOL).max_steps)
-    J, episodes = 0.0, 32
-    for i in range(episodes):
-        s, over = env.reset(seed=EVAL_SEED + i)[0], False
-        while not over:
-            s, reward, terminated, truncated, _ = env.step(rule(s))
-            J, over = J - float(reward), terminated or truncated
-    return J / episodes
-
-
 def _own(name: str, make: Callable[..., gymnasium.Env], rule: Callable[[int], float]) -> Outside:
     id = _registered(f"{name}-v0", make, 100)
     return Outside(id, "gymnasium", partial(rule, EVAL_SEED))
@@ -342,7 +292,6 @@ def _controlgym(plant: str, *overrides: str) -> Outside:
     return Outside(id, "controlgym", partial(controlgym_lqg, plant), overrides)
 
 
-LUNAR = ("task.kwargs={continuous: true}",)
 PLANTS = {
     "Pendulum": Outside("Pendulum-v1", "gymnasium"),
     "Inverted pendulum": Outside("InvertedPendulum-v5", "mujoco"),
@@ -353,14 +302,10 @@ PLANTS = {
     "pcgym multistage_extraction": _pcgym("multistage_extraction"),
     "Cart-pole from hanging": _own("SwingUp", plants.CartPole, plants.cross_entropy),
     "Two stocks in a row": _own("TwoStocks", plants.TwoStocks, plants.base_stocks),
-    "Mountain car": Outside("MountainCarContinuous-v0", "gymnasium"),
-    "Lunar lander": Outside("LunarLander-v3", "Box2D", None, LUNAR),
-    "Swimmer": Outside("Swimmer-v5", "mujoco"),
     "controlgym psm": _controlgym("psm"),
     "controlgym dis1": _controlgym("dis1"),
     "controlgym he1": _controlgym("he1"),
     "controlgym he1, log of short episodes": _controlgym("he1", "task.episode_steps=20"),
-    "PMSM, currents": Outside("gym_electric_motor:Cont-CC-PMSM-v0", "gym_electric_motor"),
     "controlgym ac5": _controlgym("ac5"),
     "controlgym he2": _controlgym("he2"),
     "controlgym umv": _controlgym("umv"),
@@ -371,12 +316,10 @@ PLANTS = {
     "controlgym he3": _controlgym("he3"),
     "controlgym convection_diffusion_reaction": _controlgym("convection_diffusion_reaction"),
     "controlgym allen_cahn": _controlgym("allen_cahn")._replace(reference=None),
-    "pcgym heat_exchanger": _pcgym("heat_exchanger"),
     "pcgym nonsmooth_control": _pcgym("nonsmooth_control"),
     "Battery in a building": Outside(
         _registered("Battery-v0", Battery, WEEK), BATTERY, battery_plans
     ),
-    "Propofol": Outside(PROPOFOL, "anesthesim", propofol_rule),
 }
 
 
@@ -420,24 +363,7 @@ def run(name: str, seed: int) -> dict[str, Any]:
     row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
     row |= {"R2_cost": start.cost.R2 if start.cost else math.nan, "order": summary["order"]}
     row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
-    return row | {"learned": math.nan, "simulated": 0, "seconds": round(seconds, 1)}
-
-
-def learned(name: str, seed: int, start: float) -> dict[str, Any]:
-    """Learn by the documented command; return J of the policy that is kept, and its transitions.
-
-    Raises:
-        ValueError: If its start does not cost ``start``, that of the row.
-    """
-    cfg = configuration(name, seed, f"eval_seed={EVAL_SEED}", "rivals=false")
-    with tempfile.TemporaryDirectory() as folder:
-        summary = train.train(cfg, folder, quiet=True)
-    if not math.isclose(summary["J_start"], start, rel_tol=1e-3):
-        message = f"{name}, seed {seed}: the row's start costs {start}, not {summary['J_start']}"
-        raise ValueError(f"{message}; delete the row to repeat it")
-    steps = cfg.num_envs * (cfg.warmup_steps + cfg.updates * cfg.steps_per_update)
-    entries = {"learned": summary["J_best"], "simulated": summary["simulated"]}
-    return entries | {"transitions": cfg.start.transitions + steps}
+    return row | {"seconds": round(seconds, 1)}
 
 
 def _costs(cfg: Config, physics: AnyPlant, policy: Any) -> torch.Tensor:
@@ -477,19 +403,6 @@ def outcomes(rows: Any) -> str:
     return f"{table(head, lines)}\n\n{total}"
 
 
-def learning(rows: Any) -> str:
-    """Format the rows that learned: the cost of their starts, and of the policies kept."""
-    lines = []
-    for name in PLANTS:
-        runs = rows[(rows["plant"] == name) & rows["learned"].notna()]
-        if len(runs):
-            J = [cost_text(float(runs[key].mean())) for key in ("start", "learned")]
-            better = (runs["learned"] < runs["start"]).sum()
-            gate = f"{runs['simulated'].mean():,.0f}"
-            lines.append([name, *J, f"{better} of {len(runs)}", gate])
-    return table(["plant", "start", "learned", "better", "transitions of the gate"], lines)
-
-
 def finished(path: Path, name: str, seed: int) -> dict[str, Any] | None:
     """Return the row of a plant and a seed, if the file has it."""
     rows: Any = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=FIELDS)
@@ -509,7 +422,7 @@ def add(path: Path, row: dict[str, Any]) -> None:
     at = same[0] if same else len(rows)
     rows[at : at + 1] = [short]
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        writer = csv.DictWriter(file, FIELDS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
@@ -520,7 +433,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--plants", nargs="+", default=[""], help="parts of the plants' names")
-    parser.add_argument("--learn", action="store_true", help="learn, too, from the same starts")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
     parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
     options = parser.parse_args(None if arguments is None else list(arguments))
@@ -536,12 +448,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
             if (row := finished(options.results, name, seed)) is None:
                 add(options.results, row := run(name, seed))
                 print(*row.values(), flush=True)
-            if options.learn and math.isnan(row["learned"]):
-                add(options.results, row | (new := learned(name, seed, row["start"])))
-                print(name, seed, *new.values(), flush=True)
     rows: Any = pd.read_csv(options.results)
-    tables = [outcomes(rows), learning(rows)] if rows["learned"].notna().any() else [outcomes(rows)]
-    write_section(options.page, "\n\n".join(tables), "starts")
+    write_section(options.page, outcomes(rows), "starts")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""Plants of `outside` that no package has: a cart-pole's swing-up, and two stocks in a row."""
+"""Plants that no package has: a swing-up, two stocks in a row, and three of known optimum."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -29,7 +30,8 @@ class CartPole(gymnasium.Env):
         return self._observed(), {}
 
     def step(self, action: Any) -> Any:
-        self.s, cost = swing(self.s, np.clip(action, -10.0, 10.0)[0])
+        s, cost = swing(self.s, np.clip(action, -10.0, 10.0)[0])
+        self.s = np.array(s)
         return self._observed(), -float(cost), False, False, {}
 
     def _observed(self) -> np.ndarray:
@@ -37,9 +39,9 @@ class CartPole(gymnasium.Env):
         return np.array([x, v, np.cos(angle), np.sin(angle), rate], np.float32)
 
 
-def swing(s: np.ndarray, force: Any) -> tuple[np.ndarray, Any]:
-    """Return the next states ``(*batch, 4)`` of cart-poles, and the costs of the step."""
-    x, v, angle, rate = np.moveaxis(s, -1, 0)
+def swing(s: Any, force: Any) -> tuple[tuple[Any, ...], Any]:
+    """Return the next states of cart-poles, and the costs of the step."""
+    x, v, angle, rate = s
     for _ in range(5):
         cos, sin = np.cos(angle), np.sin(angle)
         push = (force + 0.05 * rate**2 * sin) / 1.1
@@ -47,7 +49,16 @@ def swing(s: np.ndarray, force: Any) -> tuple[np.ndarray, Any]:
         x, v = x + 0.01 * v, v + 0.01 * (push - 0.05 * turn * cos / 1.1)
         angle, rate = angle + 0.01 * rate, rate + 0.01 * turn
     cost = 1 - np.cos(angle) + 0.1 * x**2 + 1e-3 * force**2
-    return np.stack(np.broadcast_arrays(x, v, angle, rate), -1), cost
+    return (x, v, angle, rate), cost
+
+
+def pendulum(s: Any, torque: Any) -> tuple[tuple[Any, ...], Any]:
+    """Return the next states of Gymnasium's ``Pendulum-v1``, and the costs of the step."""
+    angle, rate = s
+    away = np.arctan2(np.sin(angle), np.cos(angle))
+    cost = away**2 + 0.1 * rate**2 + 1e-3 * torque**2
+    rate = np.fmin(np.fmax(rate + 0.05 * (15 * np.sin(angle) + 3 * torque), -8.0), 8.0)
+    return (angle + 0.05 * rate, rate), cost
 
 
 def cross_entropy(seed: int, episodes: int = 32) -> float:
@@ -56,7 +67,7 @@ def cross_entropy(seed: int, episodes: int = 32) -> float:
     for i in range(episodes):
         env.reset(seed=seed + i)
         starts.append(env.s)
-    s, J = np.array(starts), np.zeros(episodes)
+    s, J = np.transpose(starts), np.zeros(episodes)
     mean = np.zeros((episodes, AHEAD))
     for _ in range(100):
         width = np.full_like(mean, 6.0)
@@ -64,7 +75,7 @@ def cross_entropy(seed: int, episodes: int = 32) -> float:
             noise = rng.standard_normal((SAMPLES, episodes, AHEAD))
             plans = np.clip(mean + width * noise, -10.0, 10.0)
             plans[0] = np.clip(mean, -10.0, 10.0)
-            at, cost = np.broadcast_to(s, (SAMPLES, episodes, 4)), 0.0
+            at, cost = s, 0.0
             for k in range(AHEAD):
                 at, own = swing(at, plans[..., k])
                 cost = cost + own
@@ -130,3 +141,145 @@ def base_stocks(seed: int, episodes: int = 32) -> float:
         env.reset(seed=seed + i)
         demand[i] = [env.np_random.gamma(4.0, 5.0 / 4.0) for _ in range(100)]
     return float(costs(levels, demand).mean())
+
+
+class Known(NamedTuple):
+    """A plant x+ = f(x) + G(x) u + noise of known optimum, with the cost x'Qx + u'Ru, Q = share P.
+
+    Attributes:
+        P: V(x) = x'Px and a constant, or its diagonal.
+        share: Q as a share of P.
+        R: the weight of each action.
+        gamma: the discount.
+        noise: standard deviations of the state's noise.
+        G: the matrix of the actions ``(n, m)`` at x.
+        turns: planes (i, j) of the state, and the angles by which f turns them at x.
+        starts: the states that episodes begin with are uniform within plus and minus these.
+        limit: of the actions; the optimal ones are within it.
+        steps: of an episode.
+    """
+
+    P: np.ndarray
+    share: float
+    R: float
+    gamma: float
+    noise: np.ndarray
+    G: Callable[[np.ndarray], np.ndarray]
+    turns: Callable[[np.ndarray], Sequence[tuple[int, int, float]]]
+    starts: np.ndarray
+    limit: float
+    steps: int
+
+    def f(self, x: np.ndarray) -> np.ndarray:
+        """Return H^(-1/2) S sqrt(P - Q) x with a rotation S: min_u of V at x+ is (P - Q)'s form."""
+        P, G, y = self.P, self.G(x), _root((1 - self.share) * self.P) @ x
+        for i, j, angle in self.turns(x):
+            cos, sin = np.cos(angle), np.sin(angle)
+            y[[i, j]] = cos * y[i] - sin * y[j], sin * y[i] + cos * y[j]
+        H = self.gamma * np.linalg.inv(np.linalg.inv(P) + self.gamma / self.R * G @ G.T)
+        return np.linalg.solve(_root(H), y)
+
+    def optimum(self, x: np.ndarray) -> np.ndarray:
+        """Return the optimal action."""
+        G = self.G(x)
+        curvature = self.R * np.eye(G.shape[1]) + self.gamma * G.T @ self.P @ G
+        return -self.gamma * np.linalg.solve(curvature, G.T @ self.P @ self.f(x))
+
+    def cost(self, x: np.ndarray, u: np.ndarray) -> float:
+        """Return the stage cost."""
+        return float(self.share * x @ self.P @ x + self.R * u @ u)
+
+    def V(self, x: np.ndarray) -> float:
+        """Return the optimal discounted cost."""
+        constant = self.gamma / (1 - self.gamma) * self.noise**2 @ self.P.diagonal()
+        return float(x @ self.P @ x + constant)
+
+
+def _root(M: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(M)
+    return (vectors * np.sqrt(values)) @ vectors.T
+
+
+def _inputs(dt: float, n: int, m: int) -> np.ndarray:
+    return dt * np.eye(n)[:, n - m :]
+
+
+#: Of Ibrahim et al., 2026, "Benchmarking Reinforcement Learning via Stochastic Converse Optimality"
+#: (arXiv 2603.17631): the first two without disturbances that V does not know, and the arm with two
+#: links, of which an action loses its effect as the cosine of the link's angle.
+CONVERSE = {
+    "Unicycle": Known(
+        P=np.diag([1 / 9, 1 / 9, 1, 1, 1]),
+        share=0.63,
+        R=1 / 256,
+        gamma=0.98,
+        noise=np.array([0.01, 0.01, 0.005, 0.02, 0.02]),
+        G=lambda x: _inputs(0.1, 5, 2),
+        turns=lambda x: (
+            (0, 1, x[2]),
+            (0, 3, angle := 0.28 * np.tanh(1.2 * x[3])),
+            (1, 3, angle),
+            (3, 4, 0.25 * np.tanh(1.5 * x[3] * x[4])),
+        ),
+        starts=np.array([3.0, 3.0, np.pi, 1.0, 1.0]),
+        limit=10.0,
+        steps=20,
+    ),
+    "Two-link manipulator": Known(
+        P=np.diag([np.pi**-2, np.pi**-2, 1, 1]),
+        share=0.5265,
+        R=9e-4,
+        gamma=0.99,
+        noise=np.array([0.0, 0.0, 2e-4, 2e-4]) ** 0.5,
+        G=lambda x: _inputs(0.05, 4, 2),
+        turns=lambda x: (
+            (0, 2, 0.35 * np.tanh(x[0] * x[2]) + 0.5 * np.sin(x[0])),
+            (1, 3, 0.35 * np.tanh(x[1] * x[3]) + 0.5 * np.sin(x[1])),
+            (2, 3, 0.3 * np.tanh(x[1] - x[0])),
+        ),
+        starts=np.array([2.0, 2.0, 1.0, 1.0]),
+        limit=25.0,
+        steps=20,
+    ),
+    "Arm": Known(
+        P=np.array(
+            [[1.4, 0.2, 0.1, 0], [0.2, 1.5, 0.2, 0.1], [0.1, 0.2, 1.6, 0.2], [0, 0.1, 0.2, 1.5]]
+        ),
+        share=0.05,
+        R=2.0,
+        gamma=0.99,
+        noise=np.array([0.0, 1e-3, 0.0, 1e-3]),
+        G=lambda x: 0.8 * np.cos(x[::2]) * np.eye(4)[:, 1::2],
+        turns=lambda x: (
+            (0, 1, 0.1 * np.tanh(x[0] * x[1]) + 0.64 * np.sin(x[0])),
+            (2, 3, 0.1 * np.tanh(x[2] * x[3]) + 0.64 * np.sin(x[2])),
+            (1, 3, 0.08 * np.tanh(x[2] - x[0])),
+        ),
+        starts=np.array([2.8, 1.2, 2.8, 1.2]),
+        limit=2.0,
+        steps=100,
+    ),
+}
+
+
+class Converse(gymnasium.Env):
+    """A plant of known optimum."""
+
+    def __init__(self, name: str) -> None:
+        self.plant = CONVERSE[name]
+        n, m = self.plant.G(self.plant.starts).shape
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float64)
+        limit = self.plant.limit
+        self.action_space = gymnasium.spaces.Box(-limit, limit, (m,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-self.plant.starts, self.plant.starts)
+        return self.x, {}
+
+    def step(self, action: Any) -> Any:
+        plant, u = self.plant, np.asarray(action)
+        reward = -plant.cost(self.x, u)
+        noise = plant.noise * self.np_random.standard_normal(len(self.x))
+        self.x = plant.f(self.x) + plant.G(self.x) @ u + noise
+        return self.x, reward, False, False, {}
