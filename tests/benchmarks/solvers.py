@@ -14,6 +14,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
@@ -28,7 +29,8 @@ from tests.benchmarks.peers import clarabel_step, cvxpylayers, osqp_step, piqp_s
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import reference_values, relative_error
 from tests.benchmarks.table import PAGE, significant
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, solve_qp
+from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
 from torch_qpmpc.study.markdown import table, write_section
@@ -38,6 +40,8 @@ BATCH, LOOP, CHECKED = 32, 4, 2
 ROUNDS, PATIENCE = 5, 1.0
 #: The columns: whether C is dense, and N, which grows.
 CASES = ((False, 20), (False, 200), (True, 5), (True, 20), (True, 100))
+#: The batch of QPs with models of their own, whose entries differ by this.
+MODELS, APART = 256, 0.02
 
 Solve = Callable[[], Tensor]
 
@@ -153,6 +157,33 @@ def series() -> str:
     return table(["", *head], lines)
 
 
+@torch.no_grad()
+def own_models() -> str:
+    """Compare QPs of own A_k and B_k with those of one model, whose theta has changed, too."""
+    size, parts = Size(20, 8, 4), []
+    mpc, s = make_mpc(size, dense=False), transitions(8, 4, MODELS).s
+    A, B, horizon = mpc.scheme.model.A, mpc.scheme.model.B, size.horizon
+    noise = torch.Generator().manual_seed(3)
+    models = (
+        [x + APART * torch.randn(horizon, *x.shape, generator=noise).double() for x in (A, B)]
+        for _ in range(MODELS)
+    )
+    C = torch.stack([banded_matrix(*model, horizon) for model in models])
+    for own in (False, True):
+        seconds = []
+        for _ in range(ROUNDS + 1):
+            nudge(mpc)
+            qp = mpc.quadratic_program()
+            qp = replace(qp, C=C) if own else qp
+            seconds.append(timed(lambda qp=qp: solve_qp(qp, s, solver="daqp").value)[0])
+        parts.append(float(np.median(seconds[1:])))
+    return (
+        f"{MODELS} QPs with own A_k, B_k, n_x = 8, n_u = 4, N = 20: "
+        f"{significant(1e3 * parts[1] / MODELS)} ms each, "
+        f"{significant(parts[1] / parts[0])} times one model's."
+    )
+
+
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.solvers", description=__doc__)
     parser.add_argument("--write", action="store_true", help="write the tables into the docs")
@@ -163,7 +194,11 @@ def main(arguments: list[str] | None = None) -> int:
     packages = ["daqp", "proxsuite", "torch", *(p for p, _ in PEERS.values()), LAYERS]
     versions = ", ".join(f"{name} {version(name)}" for name in packages if find_spec(name))
     text = "\n\n".join(
-        [f"Milliseconds a QP, with {versions}. In brackets the largest error of a value.", times]
+        [
+            f"Milliseconds a QP, with {versions}. In brackets the largest error of a value.",
+            times,
+            own_models(),
+        ]
     )
     print(text)
     if options.write:

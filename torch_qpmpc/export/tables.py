@@ -146,9 +146,8 @@ def make_tables(mpc: QPMPC) -> Tables:
     H, q, b = H * np.outer(units, units), q * units, b / of_C
 
     # z = T_p p + T_v v + z_b, with an orthonormal basis of v.
-    elimination = null_space(C[None], n_p)
-    T, Y_neg = elimination.T[0], elimination.Y_neg[0]
-    T_p, T_v, z_b = T[:, :n_p], T[:, n_p:], -Y_neg @ b
+    (T,), (Y,), *_ = null_space(C[None], n_p)
+    T_p, T_v, z_b = T[:, :n_p], T[:, n_p:], Y @ b
     T_v[np.abs(T_v).max(-1, initial=0.0) < ENTERS] = 0.0  # of states that nothing moves
     factor, condition = _factor(T_v.T @ H @ T_v)
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, flatten_batch, schema, times
+from torch_qpmpc.qp.kernels import linalg
 from torch_qpmpc.qp.kernels.active_set import hold
 from torch_qpmpc.qp.kernels.batched import largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
@@ -85,20 +86,23 @@ def _solve_kkt(
 ) -> tuple[Tensor, ...]:
     n_f, theta = programs.n_f, programs.prepared.theta
     group, H, C, G = map(to_tensor, (programs.group, theta.H, theta.C, theta.G))
-    T, Y_neg, H_y, G_y = map(to_tensor, programs.prepared.condensed(n_f)[:4])
+    condensed = programs.prepared.condensed(n_f)
+    T, H_y, G_y = map(to_tensor, (condensed.T, condensed.H, condensed.G))
+    factors = *condensed[1:3], condensed.spans[4], programs.group
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
     if grad_chi.any() or grad_xi.any():
         # A solution of C p = dl/dchi and E p = dl/dxi; the condensed system gives the rest.
-        particular = multiply(T_f, group, grad_xi) - multiply(Y_neg, group, grad_chi)
+        particular = multiply(T_f, group, grad_xi)
+        particular += to_tensor(linalg.particular(*factors, grad_chi.numpy(), z.shape[1]))
         right = right - multiply(H, group, particular)
         right_t = right_t - multiply(G, group, particular)
     system = H_y[:, n_f:, n_f:], G_y[:, :, n_f:], active, multiply(T.mT, group, right)
     v, t = _solve_active(programs, *system, torch.where(active, right_t, 0))
     p_z = particular + multiply(T, group, v)
     left = grad_z - multiply(H, group, p_z) - multiply(G.mT, group, t)
-    r = -multiply(Y_neg.mT, group, left)
+    r = -to_tensor(linalg.multipliers(*factors, left.numpy()))
     u = left[:, :n_f] - multiply(C[:, :, :n_f].mT, group, r)
     return p_z, r, t, u
 

@@ -50,22 +50,23 @@ def test_more_than_one_thread_would_take_is_multiplied_in_parts():
     np.testing.assert_allclose(found, vectors @ matrix[0].T, atol=1e-11)
 
 
-def test_spans_hold_all_nonzero_entries_of_a_single_matrix():
-    matrix = np.zeros((1, 4, 6))
-    matrix[0, 0, 2], matrix[0, 1, [0, 5]], matrix[0, 3, 3:5] = 1e-300, -1.0, np.nan
-    expected = [[2, 3], [0, 6], [0, 0], [3, 5]]
-    np.testing.assert_array_equal(linalg.row_spans(matrix), expected)
-    assert linalg.row_spans(matrix.repeat(2, 0)).shape == (0, 2)
+def test_spans_hold_all_nonzero_entries_of_any_matrix():
+    matrices = np.zeros((2, 5, 6))
+    matrices[0, 0, 2], matrices[0, 1, [0, 5]], matrices[0, 3, 3:5] = 1e-300, -1.0, np.nan
+    matrices[1, 0, 1], matrices[1, 4, 5] = np.inf, 1.0
+    expected = [[1, 3], [0, 6], [0, 0], [3, 5], [5, 6]]
+    np.testing.assert_array_equal(linalg.row_spans(matrices), expected)
 
 
+@pytest.mark.parametrize("M", [1, 3])
 @pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (0, 3), (3, 0)])
-def test_one_vector_is_multiplied_within_the_spans(i, j):
-    matrix = normal(1, i, j).numpy() * (RNG.random((1, i, j)) < 0.4)
-    left, right, spans = normal(1, i).numpy(), normal(1, j).numpy(), linalg.row_spans(matrix)
-    found = products(matrix, np.zeros(1, np.int64), right, spans)
-    np.testing.assert_allclose(found, right @ matrix[0].T, atol=1e-14)
-    found = transposed_products(matrix, np.zeros(1, np.int64), left, spans)
-    np.testing.assert_allclose(found, left @ matrix[0], atol=1e-14)
+def test_vectors_are_multiplied_within_the_spans(i, j, M):
+    matrices, group = normal(M, i, j).numpy() * (RNG.random((M, i, j)) < 0.4), np.arange(M)
+    left, right, spans = normal(M, i).numpy(), normal(M, j).numpy(), linalg.row_spans(matrices)
+    expected = np.einsum("bij,bj->bi", matrices, right)
+    np.testing.assert_allclose(products(matrices, group, right, spans), expected, atol=1e-14)
+    found = transposed_products(matrices, group, left, spans)
+    np.testing.assert_allclose(found, np.einsum("bij,bi->bj", matrices, left), atol=1e-14)
 
 
 # For each theta
@@ -73,19 +74,41 @@ def test_one_vector_is_multiplied_within_the_spans(i, j):
 
 def test_zeros_of_a_left_matrix_are_skipped():
     left = RNG.normal(size=(2, 7, 5)) * (RNG.random((2, 7, 5)) < 0.2)
-    right = RNG.normal(size=(2, 5, 3))
-    np.testing.assert_allclose(linalg.sparse_products(left, right), left @ right, rtol=1e-12)
+    right = np.tril(RNG.normal(size=(1, 5, 3)))
+    found = linalg.sparse_products(left, right, *map(linalg.row_spans, (left, right)))
+    np.testing.assert_allclose(found, left @ right, rtol=1e-12)
 
 
+@pytest.mark.parametrize("threshold", [0.3, 0.0])
 @pytest.mark.parametrize("width", [1, 4, 12])
-def test_a_band_is_eliminated(width):
+def test_a_band_is_eliminated(width, threshold):
     """The band of each row begins at its own variable, which pivoting need not choose."""
     n_c, n_z = 20, 34
     C = np.triu(np.tril(RNG.normal(size=(2, n_c, n_z)), 2 + width), 2)
-    T, Y_neg, regular = linalg.eliminate(C, 2, 1e-10)
+    T, factors, pivots, regular = linalg.eliminate(C, 2, 1e-10, threshold)
     assert regular
-    np.testing.assert_allclose(C @ T, 0, atol=1e-9)
-    np.testing.assert_allclose(-C @ Y_neg, np.eye(n_c)[None].repeat(2, 0), atol=1e-9)
+    atol = 1e-9 if threshold else 1e-5  # entries grow
+    np.testing.assert_allclose(C @ T, 0, atol=atol)
+    spans, group = linalg.row_spans(factors), np.array([1, 0, 1])
+    b, left = RNG.normal(size=(3, n_c)), RNG.normal(size=(3, n_z))
+    z = linalg.particular(factors, pivots, spans, group, b, n_z)
+    np.testing.assert_allclose(np.einsum("bij,bj->bi", C[group], z), b, atol=atol)
+    chi = linalg.multipliers(factors, pivots, spans, group, left)
+    left += np.einsum("bij,bi->bj", C[group], chi)
+    np.testing.assert_allclose(np.take_along_axis(left, pivots[group], 1), 0, atol=atol)
+
+
+def test_a_dependent_row_is_left_out():
+    C = np.concatenate((C := RNG.normal(size=(1, 2, 5)), C[:, :1]), 1)
+    *_, factors, pivots, regular = linalg.eliminate(C, 1, 1e-10, 0.3)
+    assert not regular
+    spans, z = linalg.row_spans(factors), RNG.normal(size=(1, 5))
+    found = linalg.particular(factors, pivots, spans, np.zeros(1, np.int64), z @ C[0].T, 5)
+    np.testing.assert_allclose(found @ C[0].T, z @ C[0].T)
+    left = RNG.normal(size=(1, 3)) @ C[0]
+    chi = linalg.multipliers(factors, pivots, spans, np.zeros(1, np.int64), left)
+    assert chi[0, 2] == 0
+    np.testing.assert_allclose(left, -chi @ C[0])
 
 
 class Terminal(io.StringIO):

@@ -100,4 +100,4 @@ def test_operands_with_equal_rows_are_shared():
     assert [len(x) for x in programs.theta] == [1, 1, 1, 4, 1, 1, 1, 1, 1]
     batched[0] = batched[0] * torch.arange(1.0, 5.0).double()[:, None, None]
     programs, _ = Programs.of(*batched, known.fixed)
-    assert [len(x) for x in programs.theta[:4]] == [4, 4, 4, 4]
+    assert [len(x) for x in programs.theta[:4]] == [4, 1, 1, 4]

@@ -41,7 +41,7 @@ LIES = {
 }
 
 INACCURACIES = {
-    "v off": lambda answer: answer._replace(v=answer.v + 1e-4),
+    "v off": lambda answer: answer._replace(v=answer.v + 1e-5),
     "lam off": lambda answer: answer._replace(lam=answer.lam + 1e-4),
 }
 

@@ -1,7 +1,6 @@
 """Linear algebra as loops that Numba compiles for the CPU. Arrays are float64 and contiguous.
 
-The second half runs once for each theta: the elimination of C z = b (eq:qp2c1), and sizes of its
-entries. LAPACK and NumPy, called from Python, take several times as long.
+The second half runs once for each theta. LAPACK and NumPy take several times as long.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from numba.core.event import Event, Listener, register
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
-TINY = np.finfo(float).tiny
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
@@ -111,157 +109,204 @@ def dot(x, y):
 def products(matrices, group, vectors, spans):
     """Multiply each QP's matrix by its vector: ``(M, i, j)`` and ``(B, j)`` to ``(B, i)``.
 
-    ``spans`` are the `row_spans` of the only matrix, or empty.
+    ``spans`` are the matrices' `row_spans`, or empty. Matrices of their own may share a vector.
     """
-    out = np.empty((len(vectors), matrices.shape[1]))
-    if _pays(spans, vectors):
-        for i in range(len(vectors)):
-            for j in range(len(spans)):
-                first, end = spans[j]
-                out[i, j] = dot(matrices[0, j, first:end], vectors[i, first:end])
-    elif len(matrices) == 1 and matrices.size:
-        chunk = max(1, ONE_THREAD // matrices.size)
-        for i in range(0, len(vectors), chunk):
-            np.dot(vectors[i : i + chunk], matrices[0].T, out[i : i + chunk])
-    else:
-        for i in range(len(vectors)):
-            for j in range(out.shape[1]):
-                out[i, j] = dot(matrices[group[i], j], vectors[i])
+    (M, rows, _), n = matrices.shape, len(vectors)
+    chunk, B, spans = _ways(matrices, group, vectors, spans)
+    out = np.empty((B, rows))
+    for i in range(0, B if chunk else 0, max(1, chunk)):
+        np.dot(vectors[i : i + chunk], matrices[0].T, out[i : i + chunk])
+    for i in range(0 if chunk else B):
+        for j in range(rows):
+            first, end = spans[j]
+            out[i, j] = dot(matrices[group[i] % M, j, first:end], vectors[i % n, first:end])
     return out
 
 
 @compiled
 def transposed_products(matrices, group, vectors, spans):
     """Do as `products` with transposed matrices: ``(M, i, j)`` and ``(B, i)`` to ``(B, j)``."""
-    out = np.zeros((len(vectors), matrices.shape[2]))
-    if _pays(spans, vectors):
-        for i in range(len(vectors)):
-            for j in range(len(spans)):
-                first, end = spans[j]
-                add(out[i, first:end], vectors[i, j], matrices[0, j, first:end])
-    elif len(matrices) == 1 and matrices.size:
-        chunk = max(1, ONE_THREAD // matrices.size)
-        for i in range(0, len(vectors), chunk):
-            np.dot(vectors[i : i + chunk], matrices[0], out[i : i + chunk])
-    else:
-        for i in range(len(vectors) if matrices.size else 0):
-            add_product(out[i], vectors[i], matrices[group[i]])
+    (M, rows, columns), n = matrices.shape, len(vectors)
+    chunk, B, spans = _ways(matrices, group, vectors, spans)
+    out = np.zeros((B, columns))
+    for i in range(0, B if chunk else 0, max(1, chunk)):
+        np.dot(vectors[i : i + chunk], matrices[0], out[i : i + chunk])
+    for i in range(0 if chunk else B):
+        for j in range(rows):
+            (first, end), factor = spans[j], vectors[i % n, j]
+            if factor != 0:
+                add(out[i, first:end], factor, matrices[group[i] % M, j, first:end])
     return out
 
 
 @compiled
-def row_spans(matrices):
-    """Return the first and the end of the nonzero entries in each row, ``(i, 2)``.
+def _ways(matrices, group, vectors, spans):
+    """Return how many vectors BLAS multiplies at once, the number of products, and the spans.
 
-    Of more than one matrix they are empty, ``(0, 2)``.
+    BLAS is slower for matrices of their own, one vector, or short spans.
     """
-    spans = np.zeros((matrices.shape[1] if len(matrices) == 1 else 0, 2), np.int64)
-    for i in range(len(spans)):
-        for j in range(matrices.shape[2]):
-            if matrices[0, i, j] != 0:
-                spans[i, 0] = j if spans[i, 1] == 0 else spans[i, 0]
-                spans[i, 1] = j + 1
+    (M, rows, columns), widest = matrices.shape, 0
+    for j in range(len(spans)):
+        widest = max(widest, spans[j, 1] - spans[j, 0])
+    short = len(spans) > 0 and (len(vectors) == 1 or widest <= 1)
+    if len(spans) == 0:
+        spans = np.zeros((rows, 2), np.int64)
+        spans[:, 1] = columns
+    chunk = 0 if M > 1 or short or matrices.size == 0 else max(1, ONE_THREAD // matrices.size)
+    return chunk, len(group) if M > 1 else len(vectors), spans
+
+
+@compiled
+def row_spans(matrices):
+    """Return the first and the end of the nonzero entries in each row of any, ``(i, 2)``."""
+    M, rows, columns = matrices.shape
+    spans = np.zeros((rows, 2), np.int64)
+    for i in range(rows):
+        start, end = columns, 0
+        for m in range(M):
+            for j in range(columns):  # LLVM vectorises it
+                start = min(start, j if matrices[m, i, j] != 0 else columns)
+                end = max(end, j + 1 if matrices[m, i, j] != 0 else 0)
+        spans[i, 0], spans[i, 1] = min(start, end), end
     return spans
 
 
-@compiled
-def _pays(spans, vectors):
-    """Return True if loops over spans are faster than BLAS: of one vector, or short ones."""
-    widest = 0
-    for j in range(len(spans)):
-        widest = max(widest, spans[j, 1] - spans[j, 0])
-    return len(spans) > 0 and (len(vectors) == 1 or widest <= 1)
+@summing
+def row_sums(matrices):
+    """Return the sums of the absolute entries of the rows of ``(M, i, j)``."""
+    sums = np.empty(matrices.shape[:2])
+    for m in range(len(matrices)):
+        for i in range(matrices.shape[1]):
+            total = 0.0
+            for j in range(matrices.shape[2]):
+                total += abs(matrices[m, i, j])
+            sums[m, i] = total
+    return sums
 
 
 @compiled
-def eliminate(C, n_kept, independent):
-    """Solve C z = b for some entries of z: return T and -Y with ``z = T y + Y b``.
+def eliminate(C, n_kept, independent, threshold):
+    """Solve C z = b for some entries of z: return T, with ``z = T y`` if b = 0, and factors of C.
 
-    LU with row pivoting on the transpose of C picks columns that are safe to solve for. For a
-    linear MPC scheme they are x_1..x_N, and then T is its prediction form. For a banded C, the cost
-    grows with the square of N, as T does: the loops skip the zeros outside the band.
-
-    Args:
-        C: ``(M, n_c, n_z)``.
-        n_kept: the number of leading columns that are not solved for.
-        independent: smallest pivot, relative to its row's norm, of linearly independent rows.
+    Each equation is solved for its last entry after ``n_kept`` of at least ``threshold`` times the
+    largest: x_{k+1} in a linear MPC scheme, for which T is its prediction form. For a banded C, the
+    cost grows with the square of N, as T does.
 
     Returns:
-        T ``(M, n_z, n_y)``, -Y ``(M, n_z, n_c)``, and False if the rows of C are linearly
-        dependent in the columns after ``n_kept``.
+        T ``(M, n_z, n_y)`` of C ``(M, n_c, n_z)``; the unit lower and the upper triangular factor,
+        in one, of C in its columns ``pivots``, ``(M, n_c, n_c)``; these, ``(M, n_c)``; and False if
+        rows have infinite pivots: others explain all but the fraction ``independent`` of them.
     """
-    M, n_c, n_z = C.shape
-    regular = n_c <= n_z - n_kept
-    T, Y_neg = np.zeros((M, n_z, max(0, n_z - n_c))), np.zeros((M, n_z, n_c))
+    (M, n_c, n_z), of_C, regular = C.shape, row_spans(C), True
+    T, factors = np.zeros((M, n_z, max(0, n_z - n_c))), np.zeros((M, n_c, n_c))
+    pivots, rules = np.zeros((M, n_c), np.int64), (n_kept, independent, threshold)
     for m in range(M):
-        regular = regular and _eliminate(C[m], n_kept, independent, T[m], Y_neg[m])
-    return T, Y_neg, regular
+        regular &= _eliminate(C[m].copy(), rules, of_C.copy(), T[m], factors[m], pivots[m])
+    return T, factors, pivots, regular
 
 
 @compiled
-def _eliminate(C, n_kept, independent, T, Y_neg):
-    n_c, n_z = C.shape
-    n_y, n_rest = n_z - n_c, n_z - n_kept
-    factors, order, stays = np.empty((n_rest, n_c)), np.arange(n_z), np.ones(n_z, np.bool_)
+def _eliminate(C, rules, spans, T, factors, pivots):
+    (n_c, n_z), (n_kept, independent, threshold), regular = C.shape, rules, True
+    equation, last, norms = np.full(n_z, -1), np.zeros(n_z, np.int64), np.zeros(n_c)
     for i in range(n_c):
-        for j in range(n_rest):
-            factors[j, i] = C[i, n_kept + j]
+        for j in range(spans[i, 0], spans[i, 1]):
+            if C[i, j] != 0:
+                last[j] = i
+                norms[i] += C[i, j] ** 2
     for k in range(n_c):
-        pivot, size = k, 0.0
-        for j in range(n_rest):
-            size += C[k, n_kept + j] ** 2
-        for j in range(k + 1, n_rest):
-            if abs(factors[j, k]) > abs(factors[pivot, k]):
+        (start, end), pivot, largest = spans[k], -1, 0.0
+        for j in range(max(start, n_kept), end):
+            if equation[j] < 0:
+                largest = max(largest, abs(C[k, j]))
+        small = independent * math.sqrt(norms[k])
+        for j in range(max(start, n_kept), end if largest > small else 0):
+            if equation[j] < 0 and abs(C[k, j]) >= max(small, threshold * largest):
                 pivot = j
-        if not abs(factors[pivot, k]) > independent * math.sqrt(size):
-            return False
-        if pivot != k:
-            for i in range(n_c):
-                factors[k, i], factors[pivot, i] = factors[pivot, i], factors[k, i]
-            order[n_kept + k], order[n_kept + pivot] = order[n_kept + pivot], order[n_kept + k]
-        stays[order[n_kept + k]] = False
-        for j in range(k + 1, n_rest):
-            if factors[j, k] != 0:  # few are not, in a banded C
-                factors[j, k] /= factors[k, k]
-                for i in range(k + 1, n_c):
-                    factors[j, i] -= factors[j, k] * factors[k, i]
-    # The right-hand sides are -C in the remaining columns, and the identity. The system's matrix is
-    # C in the dependent columns, the transpose of the first n_c rows of L times U.
-    right, k = np.zeros((n_c, n_z)), 0
-    for j in range(n_z):
-        if stays[j]:
-            T[j, k] = 1.0
-            for i in range(n_c):
-                right[i, k] = -C[i, j]
-            k += 1
-    for i in range(n_c):
-        right[i, n_y + i] = 1.0
-        first = 0
-        while first < i and factors[first, i] == 0:
-            first += 1
-        add_product(right[i], -factors[first:i, i], right[first:])
-        for j in range(n_z):
-            right[i, j] /= factors[i, i]
-    for i in range(n_c - 1, -1, -1):
-        end = n_c
-        while end > i + 1 and factors[end - 1, i] == 0:
-            end -= 1
-        add_product(right[i], -factors[i + 1 : end, i], right[i + 1 :])
-        dependent = order[n_kept + i]
-        for j in range(n_y):
-            T[dependent, j] = right[i, j]
-        for j in range(n_c):
-            Y_neg[dependent, j] = -right[i, n_y + j]
-    return True
+        if pivot < 0:
+            regular, factors[k, k] = False, np.inf
+            continue
+        pivots[k], equation[pivot] = pivot, k
+        for i in range(k + 1, last[pivot] + 1):
+            if C[i, pivot] != 0:
+                factors[i, k] = C[i, pivot] / C[k, pivot]
+                add(C[i, start:end], -factors[i, k], C[k, start:end])
+                C[i, pivot], spans[i, 0] = 0.0, min(spans[i, 0], start)
+                spans[i, 1] = max(spans[i, 1], end)
+        for j in range(start, end):
+            last[j] = max(last[j], last[pivot])
+    for k in range(n_c - 1, -1, -1):
+        for j in range(spans[k, 0], spans[k, 1]):
+            i = equation[j]
+            if i >= k and factors[k, k] < np.inf:
+                factors[k, i] = C[k, j]
+                if i > k and C[k, j] != 0:
+                    start, end = spans[i]
+                    add(C[k, start:end], -C[k, j] / C[i, j], C[i, start:end])
+                    C[k, j], spans[k, 0] = 0.0, min(spans[k, 0], start)
+                    spans[k, 1] = max(spans[k, 1], end)
+    column = np.cumsum(equation < 0) - 1
+    for j in range(n_z if regular else 0):
+        k = equation[j]
+        if k < 0:
+            T[j, column[j]] = 1.0
+            continue
+        for i in range(spans[k, 0], spans[k, 1]):
+            if equation[i] < 0:
+                T[j, column[i]] = -C[k, i] / C[k, j]
+    return regular
 
 
 @compiled
-def sparse_products(left, right):
-    """Multiply ``(M, i, j)`` by ``(M, j, k)``, ignoring the left matrices' zeros."""
-    out = np.zeros((len(left), left.shape[1], right.shape[2]))
-    for m in range(len(left)):
+def particular(factors, pivots, spans, group, b, n_z):
+    """Return solutions of C z = b ``(B, n_c)``, ``(B, n_z)``; Y b without ``pivots``."""
+    M, _, n_c = factors.shape
+    if pivots.shape[1] < n_c:
+        return products(factors, group, b, spans)
+    z, x = np.zeros((len(group) if M > 1 else len(b), n_z)), np.empty(n_c)
+    for i in range(len(z)):
+        L_U = factors[group[i] % M]
+        copy(x, b[i % len(b)])
+        for k in range(n_c):
+            first = spans[k, 0]
+            x[k] -= dot(L_U[k, first:k], x[first:k])
+        for k in range(n_c - 1, -1, -1):
+            end = spans[k, 1]
+            x[k] = (x[k] - dot(L_U[k, k + 1 : end], x[k + 1 : end])) / L_U[k, k]
+            z[i, pivots[group[i] % M, k]] += x[k]
+    return z
+
+
+@compiled
+def multipliers(factors, pivots, spans, group, left):
+    """Return chi ``(B, n_c)`` with ``left + C'chi = 0`` in the pivots' columns, or ``-Y'left``."""
+    M, _, n_c = factors.shape
+    if pivots.shape[1] < n_c:
+        return transposed_products(factors, group, -left, spans)
+    chi = np.empty((len(left), n_c))
+    for i in range(len(left)):
+        L_U, x = factors[group[i] % M], chi[i]
+        for k in range(n_c):
+            x[k] = -left[i, pivots[group[i] % M, k]]
+        for k in range(n_c):
+            end = spans[k, 1]
+            x[k] /= L_U[k, k]
+            add(x[k + 1 : end], -x[k], L_U[k, k + 1 : end])
+        for k in range(n_c - 1, -1, -1):
+            first = spans[k, 0]
+            add(x[first:k], -x[k], L_U[k, first:k])
+    return chi
+
+
+@compiled
+def sparse_products(left, right, of_left, of_right):
+    """Multiply ``(M or 1, i, j)`` by ``(M or 1, j, k)``, with their `row_spans`, without zeros."""
+    M = max(len(left), len(right))
+    out = np.zeros((M, left.shape[1], right.shape[2]))
+    for m in range(M):
         for i in range(left.shape[1]):
-            for j in range(left.shape[2]):
-                if left[m, i, j] != 0:
-                    add(out[m, i], left[m, i, j], right[m, j])
+            for j in range(of_left[i, 0], of_left[i, 1]):
+                factor, (first, end) = left[m % len(left), i, j], of_right[j]
+                if factor != 0:
+                    add(out[m, i, first:end], factor, right[m % len(right), j, first:end])
     return out

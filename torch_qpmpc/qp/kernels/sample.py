@@ -42,6 +42,8 @@ from torch_qpmpc.qp.kernels.linalg import (
     compiled,
     copy,
     dot,
+    multipliers,
+    particular,
     products,
     summing,
     transposed_products,
@@ -114,7 +116,8 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     """
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
-    of_H, of_C, of_G, of_T, of_Y = sizes.spans
+    factors, pivots = reduced.factors, reduced.pivots
+    of_H, of_C, of_G, of_T, of_factors = sizes.spans
     kept = np.empty((n_qps, n_f + v.shape[1]))
     for i in range(n_qps):
         copy(kept[i, :n_f], fixed[i])
@@ -126,7 +129,7 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     for _ in range(passes):
         for i in range(n_qps):
             add(Cz[i], -1.0, theta.b[i % len(theta.b)])
-        z += products(reduced.Y_neg, group, Cz, of_Y)
+        z -= particular(factors, pivots, of_factors, group, Cz, z.shape[1])
         Cz = products(C, group, z, of_C)
     Hz, y = products(H, group, z, of_H), products(G, group, z, of_G)
     lam, codes = _all_multipliers(lam_v, y, theta, reduced.rows, reduced.others)
@@ -134,10 +137,10 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     left = Hz + G_lam
     for i in range(n_qps):
         add(left[i], 1.0, q[i % len(q)])
-    chi = transposed_products(reduced.Y_neg, group, left, of_Y)
+    chi = multipliers(factors, pivots, of_factors, group, left)
     C_chi = transposed_products(C, group, chi, of_C)
     for _ in range(passes):
-        chi += transposed_products(reduced.Y_neg, group, left + C_chi, of_Y)
+        chi += multipliers(factors, pivots, of_factors, group, left + C_chi)
         C_chi = transposed_products(C, group, chi, of_C)
     left += C_chi
     xi = -left[:, :n_f]
@@ -209,6 +212,7 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
     apart = sizes.apart
     for i in range(len(z)):
         q_i, b_i, m = q[i % len(q)], b[i % len(b)], group[i]
+        H_m, C_m, G_m = H[m % len(H)], C[m % len(C)], G[m % len(G)]
         lb_i, ub_i, w_i = lb[i % len(lb)], ub[i % len(ub)], w[i % len(w)]
         linear, quadratic = _cost(z[i], Hz[i], q_i)
         charge, gap = _charge(y[i], lam[i], lb_i, ub_i, w_i)
@@ -216,20 +220,20 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         cost = linear + quadratic + charge
         value[i] = cost + c[i % len(c)]
         force, steep, length = _forces(z[i], Hz[i], G_lam[i], C_chi[i], left[i], q_i)
-        worst = max(steep / (1.0 + force), _short(Cz[i], b_i, C[m], z[i]))
+        worst = max(steep / (1.0 + force), _short(Cz[i], b_i, C_m, z[i]))
         for j in range(n_f):
             worst = max(worst, abs(z[i, j] - fixed[i, j]))
-        worst = max(worst, _violation(y[i], lb_i, ub_i, w_i, G[m], z[i]))
+        worst = max(worst, _violation(y[i], lb_i, ub_i, w_i, G_m, z[i]))
         worst = max(worst, gap / (1.0 + abs(cost)))
 
         scale = max(abs(cost), abs(linear), abs(quadratic), charge)
         scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
-        scale = max(scale, SHARE * _swing(Hz[i], q_i, lb_i, ub_i, w_i, G[m], sizes.bounds, length))
+        scale = max(scale, SHARE * _swing(Hz[i], q_i, lb_i, ub_i, w_i, G_m, sizes.bounds, length))
         noise = _weighted(z[i], sizes.costs[m]) + _weighted(lam[i], sizes.rows[m])
         noise = length * (noise + _weighted(chi[i], sizes.equalities[m]))
         if not ROUNDING * noise < DOUBTFUL * scale:  # the same without the largest entry of z
-            noise = _terms(z[i], H[m], z[i]) + _terms(lam[i], G[m], z[i])
-            noise += _terms(chi[i], C[m], z[i])
+            noise = _terms(z[i], H_m, z[i]) + _terms(lam[i], G_m, z[i])
+            noise += _terms(chi[i], C_m, z[i])
         noise += _weighted(z[i], q_i)
         slope, steps = slopes[i, n_f:], sizes.steps[m]
         far = RANGE * length if shift[m] > 0 else np.inf
@@ -238,17 +242,18 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
             curved = (inverse[m], reduced.H[m])
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
             of_slope = split if split < of_slope else of_slope
-            slope = _transposed(reduced.T[m], Hz[i], q_i)[n_f:]
+            slope = _transposed(reduced.T[m % len(reduced.T)], Hz[i], q_i)[n_f:]
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
-            free_chi = _transposed(reduced.Y_neg[m], Hz[i], q_i)
+            factors = (reduced.factors, reduced.pivots, sizes.spans[4])
+            free_chi = multipliers(*factors, group[i : i + 1], (Hz[i] + q_i).reshape(1, -1))[0]
             split += charge + _shortage(Cz[i], b_i, free_chi)
             if split < gap + of_slope:
                 gap, of_slope = 0.0, split
         rows = (y[i], lam[i], lb_i, ub_i, w_i, steps)
         if apart:
-            step = _repair_apart(rows, hard, z[i], G[m])
+            step = _repair_apart(rows, hard, z[i], G_m)
         else:
-            step = _repair(rows, hard, z[i], G[m], sizes.units[m], basis, ends, slacks)
+            step = _repair(rows, hard, z[i], G_m, sizes.units[m], basis, ends, slacks)
         off = gap + of_slope + ROUNDING * noise + (steep + 0.5 * sizes.stiffness[m] * step) * step
         off += _kinks(y[i], lb_i, ub_i, w_i, steps, step)
         # Sums propagate a NaN in any entry; maxima ignore it.

@@ -23,7 +23,7 @@ class Theta(NamedTuple):
     """B QPs over M distinct matrix triples, in float64, in another order than `QuadraticProgram`.
 
     H ``(M, n_z, n_z)``, symmetric, C ``(M, n_c, n_z)``, G ``(M, n_g, n_z)``, q ``(B, n_z)``, c
-    ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``. A vector that the batch shares has one row.
+    ``(B,)``, b ``(B, n_c)``, lb, ub, w ``(B, n_g)``. What the batch shares has a leading one.
     """
 
     H: Array

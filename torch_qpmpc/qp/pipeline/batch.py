@@ -25,6 +25,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     BatchSolution,
     SoftQPs,
     Theta,
+    per_qp,
     to_numpy,
 )
 from torch_qpmpc.qp.pipeline.condensing import (
@@ -69,15 +70,9 @@ class Prepared:
     z: V and Q that keep the same ones share it.
     """
 
-    def __init__(
-        self,
-        theta: Theta,
-        group: np.ndarray,
-        n_kept: int,
-        elimination: Elimination | None = None,
-    ) -> None:
+    def __init__(self, theta: Theta, group: np.ndarray, n_kept: int) -> None:
         self.theta, self.group, self.n_kept = theta, group, n_kept
-        self._elimination = elimination
+        self.elimination: Elimination | None = None
         self.known: dict[tuple, Any] = {}
 
     @cached_property
@@ -91,8 +86,7 @@ class Prepared:
         """Mask of finite data, lb <= ub and w >= 0, ``(B or 1,)``; None if all are valid."""
         H, C, G, q, c, b, lb, ub, w = self.theta
         # A sum is finite if its terms are, but for overflow, which no solver survives either.
-        finite = np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G)))
-        finite = finite if len(H) == 1 else finite[self.group]
+        finite = per_qp(np.isfinite(sum(x.sum((1, 2)) for x in (H, C, G))), self.group)
         # The widths of bounds are NaN if both are the same infinity.
         valid = np.isfinite(q.sum(-1) + b.sum(-1) + c) & finite
         valid = valid & (ub - lb >= 0).all(-1) & (w >= 0).all(-1)
@@ -119,7 +113,7 @@ class Prepared:
 
     @kept
     def _condensed(self, n_kept: int) -> Condensed:
-        return condense(self.theta, n_kept, self._elimination)
+        return condense(self.theta, n_kept, self.elimination)
 
     @kept
     def reduced(self, n_f: int) -> Reduced:
@@ -129,7 +123,8 @@ class Prepared:
     @kept
     def convex(self, n_f: int) -> np.ndarray | None:
         """Return the mask of positive semidefinite reduced H, ``(M,)``; None if all are."""
-        surely = self.condensed(n_f).surely_convex
+        # Cholesky factors prove it; eigenvalues take many times as long.
+        surely = np.isfinite(self.sizes(n_f).inverse).all()
         return None if surely or (mask := convex(self.reduced(n_f).H)).all() else mask
 
     @kept
@@ -146,7 +141,8 @@ class Prepared:
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""
         theta = self.theta._replace(lb=lb, ub=ub)
-        other = Prepared(theta, self.group, self.n_kept, self._elimination)
+        other = Prepared(theta, self.group, self.n_kept)
+        other.elimination = self.elimination
         same = ("_condensed", "convex", "dual", "sizes")
         other.known = {key: x for key, x in self.known.items() if key[0] in same}
         vars(other)["units"] = self.units
@@ -158,13 +154,11 @@ class Prepared:
     def part(self, group: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, Prepared]:
         """Return the new group and theta of the QPs at ``index``, whose matrices are ``group``."""
         used, group = np.unique(group, return_inverse=True)
+        if len(used) and used[-1] - used[0] == len(used) - 1:
+            used = slice(used[0], used[-1] + 1)  # without a copy
         matrices = (x if len(x) == 1 else x[used] for x in self.theta[:3])
         vectors = (x if len(x) == 1 else x[index] for x in self.theta[3:])
         return group, Prepared(Theta(*matrices, *vectors), group, self.n_kept)
-
-    def eliminated(self, elimination: Elimination, n_f: int) -> Prepared:
-        """Return the same theta with another elimination of C z = b, which keeps n_f entries."""
-        return Prepared(self.theta, self.group, n_f, elimination)
 
 
 #: The least number of QPs that are worth a thread.
@@ -255,10 +249,6 @@ class Programs:
         _, length, *_ = units.per_qp(group)
         return Programs(self.prepared.scaled, group, self.fixed / length[:, : self.n_f])
 
-    def eliminated(self, elimination: Elimination) -> Programs:
-        """Return the same QPs with another elimination of C z = b."""
-        return Programs(self.prepared.eliminated(elimination, self.n_f), self.group, self.fixed)
-
     def solvable(self) -> np.ndarray | None:
         """Return the indices of QPs with valid data and a convex cost; None for all.
 
@@ -297,8 +287,8 @@ class Programs:
         """Return the mask of QPs with valid data, ``(B,)``; None if all are valid."""
         valid = self.prepared.valid
         # A sum is finite if its terms are (except on overflow, which no solver survives either).
-        if np.isfinite(float(self.fixed.sum())):
-            return valid if valid is None or len(valid) == len(self) else valid.repeat(len(self))
+        if valid is None and np.isfinite(float(self.fixed.sum())):
+            return None
         finite = np.isfinite(self.fixed.sum(-1))
         return finite if valid is None else finite & valid
 
@@ -353,21 +343,20 @@ def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:
 def _flat_theta(theta: Sequence[Tensor], batch: torch.Size) -> tuple[list[np.ndarray], np.ndarray]:
     """Return theta with one leading dimension, and the group of each QP.
 
-    A vector that the batch shares has one row, and so have all three matrices together.
+    What the batch shares has a leading one.
     """
-    flat: list[Any] = [None] * len(theta)
-    matrix_batch = broadcast(*(theta[i].shape[:-2] for i in MATRICES))
-    for i, (x, n) in enumerate(zip(theta, NDIMS, strict=True)):
+    flat, matrix_batch = [], broadcast(*(theta[i].shape[:-2] for i in MATRICES))
+    for x, n in zip(theta, NDIMS, strict=True):
         event = x.shape[x.ndim - n :]
-        shape = matrix_batch if n == 2 else batch
-        rows = x.reshape(event) if x.numel() == event.numel() else x
-        flat[i] = to_numpy(_flattened(rows, torch.Size([1]) if rows.ndim == n else shape, event))
-        if len(flat[i]) > 1 and (flat[i] == flat[i][0]).all():
-            flat[i] = flat[i][:1]
+        shape = torch.Size([1]) if x.numel() == event.numel() else matrix_batch if n == 2 else batch
+        rows = x.reshape(event) if len(shape) == 1 == shape[0] else x
+        rows = to_numpy(_flattened(rows, shape, event))
+        same = len(rows) > 1 and (rows[-1] == rows[0]).all() and (rows == rows[0]).all()
+        flat.append(rows[:1] if same else rows)
+    M = matrix_batch.numel()
     if all(len(flat[i]) == 1 for i in MATRICES):
         return flat, np.zeros(batch.numel(), np.int64)
-    M = matrix_batch.numel()
-    for i in MATRICES:
-        flat[i] = flat[i] if len(flat[i]) == M else flat[i].repeat(M, axis=0)
+    if not M:
+        flat = [x[:0] if i in MATRICES else x for i, x in enumerate(flat)]
     group = np.arange(M).reshape(matrix_batch)
     return flat, np.broadcast_to(group, batch).reshape(-1).astype(np.int64)

@@ -1,13 +1,13 @@
 """Condensing: eliminate C z = b once per theta, so that samples differ only in vectors.
 
 With y = (z[:n_kept], v), the kept leading entries and the independent ones among the rest, every
-solution of C z = b is ``z = Y b + T y``. All samples of a batch, and V, Q and the policy, share T,
-Y, T'HT and GT; fixing the first n_f <= n_kept entries then only changes the linear cost and bounds.
+solution of C z = b is ``z = z_0 + T y``. All samples of a batch, and V, Q and the policy, share T,
+T'HT and GT; fixing the first n_f <= n_kept entries then only changes the linear cost and bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,16 +15,15 @@ import torch
 
 from torch_qpmpc.qp.kernels import linalg as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
-from torch_qpmpc.qp.pipeline.scaling import row_sums
 
 #: A pivot below this fraction of its row's norm means that rows of C are linearly dependent.
 RANK_TOLERANCE = 1e-10
-#: `in_order` accepts a pivot of at least this fraction of the largest.
-THRESHOLD = 1e-2
 #: Largest share of nonzero entries of a matrix that BLAS does not multiply faster.
 SPARSE = 0.1
 #: A coefficient up to this fraction of its row's absolute sum counts as rounding.
 ENTERS = 1e-12
+#: Each pivot is at least this fraction of the largest.
+THRESHOLD = 0.3
 #: A reduced row with a smaller fraction of its terms contains no variable at all.
 ABSENT = 1e-15
 #: A pivot of H below this fraction of the largest diagonal entry means that H is singular, ..
@@ -33,43 +32,42 @@ DEFINITE = 1e-11
 SHIFT = 1e-10
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
-TINY = np.finfo(float).tiny
 
 
 class Elimination(NamedTuple):
-    """The solutions ``z = Y b + T y`` of C z = b.
+    """The null space of C, T ``(M, n_z, n_y)``, and factors of C, see `kernels.eliminate`.
 
-    T ``(M, n_z, n_y)`` and Y ``(M, n_z, n_c)``. ``padding`` ``(M, n_y)`` marks zero columns of T,
-    where C has a lower rank elsewhere in the batch; None if C has full row rank in the columns
-    after ``n_kept``.
+    Without ``pivots``, the factors are a dense Y ``(M, n_z, n_c)`` with ``C Y b = b``.
+    ``padding`` ``(M, n_y)`` marks zero columns of T, where C has a lower rank elsewhere in the
+    batch; None if C has full row rank in the columns after ``n_kept``.
     """
 
     T: np.ndarray
-    Y_neg: np.ndarray
+    factors: np.ndarray
+    pivots: np.ndarray
     padding: np.ndarray | None
 
 
 class Condensed(NamedTuple):
-    """The QPs' matrices in y: T, -Y, T'HT, GT, and the factors T'HY and GY of b, with a leading M.
+    """The QPs' matrices in y: those of `Elimination`, T'HT and GT, with a leading M.
 
-    ``surely_convex`` is True if all of H is known to be convex. If ``deficient``, the columns of C
-    after the kept entries do not have full row rank, and the arrays are valid only for QPs that fix
-    exactly these. ``enters`` ``(n_g, n_y)`` is True where a row of G contains a variable of y, but
-    for rounding, relative to its ``terms`` ``(M, n_g)`` before the elimination. ``sums`` are those
-    of the absolute entries in the rows of H, G and C.
+    If ``deficient``, the columns of C after the kept entries do not have full row rank, and the
+    arrays are valid only for QPs that fix exactly these. ``enters`` ``(n_g, n_y)`` is True where a
+    row of G contains a variable of y, but for rounding, relative to its ``terms`` ``(M, n_g)``
+    before the elimination. ``sums`` are those of the absolute entries in the rows of H, G and C,
+    and ``spans`` the `row_spans` of H, C, G, T and the factors.
     """
 
     T: np.ndarray
-    Y_neg: np.ndarray
+    factors: np.ndarray
+    pivots: np.ndarray
     H: np.ndarray
     G: np.ndarray
-    H_b: np.ndarray
-    G_b: np.ndarray
     enters: np.ndarray
     terms: np.ndarray
     sums: tuple[np.ndarray, np.ndarray, np.ndarray]
     deficient: bool
-    surely_convex: bool
+    spans: tuple[np.ndarray, ...]
 
 
 class Reduced(NamedTuple):
@@ -85,7 +83,7 @@ class Reduced(NamedTuple):
             ``constant + matrix' fixed``.
         z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
         w: ``(B, r)``.
-        T, Y_neg: those of `Elimination`.
+        T, factors, pivots: see `Elimination`.
     """
 
     rows: Array
@@ -97,7 +95,8 @@ class Reduced(NamedTuple):
     z_0: Array
     w: Array
     T: Array
-    Y_neg: Array
+    factors: Array
+    pivots: Array
 
 
 class Sizes(NamedTuple):
@@ -116,7 +115,7 @@ class Sizes(NamedTuple):
         bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
         units: the hard rows in v, of unit length, ``(M, h, d)``.
         apart: True if each subset of these rows is well conditioned.
-        spans: the `row_spans` of H, C, G, T and Y_neg.
+        spans: those of `Condensed`.
     """
 
     inverse: Array
@@ -151,62 +150,53 @@ class Dual(NamedTuple):
 @np.errstate(all="ignore")  # predictions of unstable models may overflow
 def condense(theta: Theta, n_kept: int, elimination: Elimination | None = None) -> Condensed:
     """Condense M matrix triples, keeping the first ``n_kept`` entries of z."""
-    T, Y_neg, padding = elimination or eliminate(theta.C, n_kept)
-    T[:, :, n_kept:][np.abs(T[:, :, n_kept:]).max(-1, initial=0.0) < ENTERS] = 0.0  # rounding
-    H_T = _products(theta.H, T)
-    H = T.swapaxes(1, 2) @ H_T
+    T, factors, pivots, padding = elimination or eliminate(theta.C, n_kept)
+    T_v = T[:, :, n_kept:]
+    T_v[kernels.row_sums(np.ascontiguousarray(T_v)) < ENTERS] = 0.0  # rounding
+    spans = of_H, _, of_G, of_T, _ = (*map(kernels.row_spans, (*theta[:3], T, factors)),)
+    H = T.swapaxes(1, 2) @ _products(theta.H, T, of_H, of_T)
     H = (H + H.swapaxes(1, 2)) / 2
-    H_b, G_b = -(H_T.swapaxes(1, 2) @ Y_neg), -_products(theta.G, Y_neg)
     if padding is not None:  # a unit curvature sets the variables of zero columns to zero
         H = H + padding[:, :, None] * np.eye(H.shape[1])
-    G = _products(theta.G, T)
+    G = _products(theta.G, T, of_G, of_T)
+    M = max(len(H), len(G))
+    H, G = (x if len(x) == M else x.repeat(M, 0) for x in (H, G))
     # Rounding leaves traces of variables that a row does not contain, and all of a row that C
     # implies: sizes are compared with those before the elimination.
-    terms = np.abs(theta.G) @ row_sums(T)[:, :, None]
-    enters = (np.abs(G) > ENTERS * terms).any(0)
-    sums = row_sums(theta.H), row_sums(theta.G), row_sums(theta.C)
-    # Cholesky factors prove it; eigenvalues take many times as long.
-    shift = CONVEX * (1 + H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0))
-    shifted = torch.from_numpy(H + shift[:, None, None] * np.eye(H.shape[1]))
-    convex = padding is None and not torch.linalg.cholesky_ex(shifted).info.any()
-    deficient = padding is not None
-    return Condensed(T, Y_neg, H, G, H_b, G_b, enters, terms[:, :, 0], sums, deficient, convex)
+    terms = kernels.products(np.abs(theta.G), np.arange(M), kernels.row_sums(T), of_G)
+    enters = (np.abs(G) > ENTERS * terms[:, :, None]).any(0)
+    sums = map(kernels.row_sums, (theta.H, theta.G, theta.C))
+    sums = tuple(x if len(x) == M else x.repeat(M, 0) for x in sums)
+    return Condensed(T, factors, pivots, H, G, enters, terms, sums, padding is not None, spans)
 
 
-def _products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Multiply ``(M, i, j)`` by ``(M, j, k)``; the left matrices of an MPC scheme are sparse."""
-    if np.count_nonzero(left) > SPARSE * left.size:
+def _products(left: np.ndarray, right: np.ndarray, *spans: np.ndarray) -> np.ndarray:
+    """Multiply ``(M, i, j)`` by ``(M, j, k)``, of these `row_spans`; an MPC's H, G are sparse."""
+    if np.diff(spans[0]).sum() > SPARSE * left[:1].size:
         return left @ right
-    return kernels.sparse_products(left, np.ascontiguousarray(right))
+    return kernels.sparse_products(left, right, *spans)
 
 
 @np.errstate(all="ignore")
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
     """Reduce condensed QPs to those with the first n_f entries fixed."""
-    T, Y_neg, H, G, H_b, G_b, *_ = condensed
+    T, factors, pivots, H, G, *_ = condensed
     bounded = ((theta.lb > -np.inf) | (theta.ub < np.inf)).any(0)
     entering = bounded & condensed.enters[:, n_f:].any(-1)
     rows, others = np.flatnonzero(entering), np.flatnonzero(~entering)
-    H, H_b, G, G_b = H[:, n_f:], H_b[:, n_f:], G[:, rows], G_b[:, rows]
+    H, G = H[:, n_f:], G[:, rows]
     fixed_g, fixed_y = H[:, :, :n_f].swapaxes(1, 2), -G[:, :, :n_f].swapaxes(1, 2)
     matrix = np.concatenate((fixed_g, fixed_y, fixed_y), axis=-1)
-    q, b, lb, ub = theta.q, theta.b, theta.lb[:, rows], theta.ub[:, rows]
-    d, r, y_b = H.shape[1], len(rows), _times(G_b, group, b)
-    shared = np.broadcast_shapes(*(x.shape[:1] for x in (q, b, lb, ub)))
-    count = shared[0] if len(T) == 1 else len(group)
-    constant = np.empty((count, d + 2 * r))
-    constant[:, :d] = _times(T[:, :, n_f:].swapaxes(1, 2), group, q) + _times(H_b, group, b)
-    constant[:, d : d + r], constant[:, d + r :] = lb - y_b, ub - y_b
-    z_0 = -_times(Y_neg, group, b)
+    d, r, lb, ub = H.shape[1], len(rows), theta.lb[:, rows], theta.ub[:, rows]
+    of_H, _, of_G, of_T, of_C = condensed.spans
+    z_0 = kernels.particular(factors, pivots, of_C, group, theta.b, T.shape[1])
+    of_y = kernels.products(theta.G, group, z_0, of_G)[:, rows]
+    slope = theta.q + kernels.products(theta.H, group, z_0, of_H)
+    of_v = kernels.transposed_products(T, group, slope, of_T)[:, n_f:]
+    constant = np.empty((max(map(len, (of_v, of_y, lb, ub))), d + 2 * r))
+    constant[:, :d], constant[:, d : d + r], constant[:, d + r :] = of_v, lb - of_y, ub - of_y
     arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows])
-    return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, Y_neg))
-
-
-def _times(matrices: np.ndarray, group: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Multiply ``(M, i, j)`` by ``(B or 1, j)``, each by the matrix ``group`` of its QP."""
-    if len(matrices) == 1:
-        return vectors @ matrices[0].T
-    return (matrices[group] @ vectors[:, :, None])[:, :, 0]
+    return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, factors, pivots))
 
 
 @np.errstate(all="ignore")
@@ -225,13 +215,12 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
     # Contiguous whatever the indices, or the kernels would be compiled for each layout.
     units = np.ascontiguousarray(G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None])
-    cosines = row_sums(units @ units.swapaxes(1, 2)) - (steps[:, hard] > 0)
+    cosines = kernels.row_sums(units @ units.swapaxes(1, 2)) - (steps[:, hard] > 0)
     apart = bool((cosines < 0.5).all())
     inverse, shift = inverse_factors(H)
-    stiffness = row_sums(H).max(-1, initial=0.0)
+    stiffness = kernels.row_sums(H).max(-1, initial=0.0)
     rows = steps, hard, box, bounds, units, apart
-    spans = tuple(map(kernels.row_spans, (*theta[:3], *condensed[:2])))
-    return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, spans)
+    return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, condensed.spans)
 
 
 def inverse_factors(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -244,7 +233,7 @@ def inverse_factors(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     factors, failed = torch.linalg.cholesky_ex(matrices)
     pivots = factors.numpy().diagonal(axis1=1, axis2=2).min(-1, initial=np.inf) ** 2
     singular = (failed.numpy() > 0) | ~(pivots > DEFINITE * largest)
-    shift = np.where(singular, np.maximum(SHIFT * largest, TINY), 0.0)
+    shift = np.where(singular, np.maximum(SHIFT * largest, np.finfo(float).tiny), 0.0)
     if singular.any():
         shifted = matrices + torch.from_numpy(shift)[:, None, None] * one
         factors, failed = torch.linalg.cholesky_ex(shifted)
@@ -275,89 +264,42 @@ def convex(H: np.ndarray) -> np.ndarray:
     return eigenvalues[:, 0] >= -CONVEX * (1 + np.abs(eigenvalues).max(-1))
 
 
-def eliminate(C: np.ndarray, n_kept: int) -> Elimination:
-    """Eliminate C z = b by LU, or by the SVD if rows of C ``(M, n_c, n_z)`` are dependent."""
-    T, Y_neg, regular = kernels.eliminate(C, n_kept, RANK_TOLERANCE)
-    return Elimination(T, Y_neg, None) if regular else null_space(C, n_kept)
-
-
 @np.errstate(all="ignore")
-def in_order(C: np.ndarray, n_kept: int) -> Elimination | None:
-    """Eliminate C z = b in the order of the equations; None if rows of C are dependent.
+def eliminate(C: np.ndarray, n_kept: int, threshold: float = THRESHOLD) -> Elimination:
+    """Eliminate C z = b by LU, or by the SVD if rows of C ``(M, n_c, n_z)`` are dependent.
 
-    Each equation is solved for a variable that no earlier C_m contains, in a linear MPC scheme
-    x_1..x_N. If the actions of an unstable model are at their bounds and its states grow, only this
-    recursion is accurate in every entry.
+    With a ``threshold`` of zero, each equation is solved for its last entry, whatever its size. If
+    the actions of an unstable model are at their bounds and its states grow, only this recursion is
+    accurate in every entry.
     """
-    results = [_in_order(C_m, n_kept) for C_m in C] if C.shape[1] else [None]
-    if not all(results):
-        return None
-    T, Y = (np.stack(x) for x in zip(*results, strict=True))
-    return Elimination(T, -Y, None) if np.isfinite(T).all() and np.isfinite(Y).all() else None
-
-
-def _in_order(C: np.ndarray, n_kept: int) -> tuple[np.ndarray, np.ndarray] | None:
-    n_c, n_z = C.shape
-    # The rows of W stand for C z - b = 0, which is not solved for the first n_kept entries of z.
-    W = np.concatenate((C, -np.eye(n_c)), axis=1)
-    first = np.where(C.any(0), (C != 0).argmax(0), -1)
-    first[:n_kept] = -1
-    pivots = []
-    for k in range(n_c):
-        entries = np.where(first >= 0, np.abs(W[k, :n_z]), 0.0)
-        possible = entries > RANK_TOLERANCE * np.linalg.norm(C[k])
-        if not possible.any():
-            return None
-        newest = np.where(possible & (first == first[possible].max()), entries, 0.0)
-        # The last of the newest variables: in z, x_{k+1} comes after u_k.
-        pivot = int((newest >= THRESHOLD * newest.max()).nonzero()[0][-1])
-        first[pivot] = -1
-        pivots.append(pivot)
-        W[k] /= W[k, pivot]
-        below = k + 1 + W[k + 1 :, pivot].nonzero()[0]
-        W[below] -= np.outer(W[below, pivot], W[k])
-    for k in range(n_c - 1, -1, -1):
-        above = W[:k, pivots[k]].nonzero()[0]
-        W[above] -= np.outer(W[above, pivots[k]], W[k])
-    columns = np.setdiff1d(np.arange(n_z), pivots)
-    T, Y = np.zeros((n_z, len(columns))), np.zeros((n_z, n_c))
-    T[columns, np.arange(len(columns))] = 1.0
-    T[pivots], Y[pivots] = -W[:, columns], -W[:, n_z:]
-    return T, Y
+    *parts, regular = kernels.eliminate(C, n_kept, RANK_TOLERANCE, threshold)
+    return Elimination(*parts, None) if regular else null_space(C, n_kept)
 
 
 def null_space(C: np.ndarray, n_kept: int) -> Elimination:
     """Eliminate C z = b in an orthonormal basis, from the SVD, for a C of any rank.
 
-    This elimination is the best conditioned, though not the sparsest. Y is the pseudo-inverse: the
-    certificate rejects an inconsistent C z = b.
+    This elimination is the best conditioned, though not the sparsest. The factors are the
+    pseudo-inverse: the certificate rejects an inconsistent C z = b.
     """
-    M, n_c, n_z = C.shape
-    n_rest = n_z - n_kept
+    (M, n_c, n_z), n_rest = C.shape, C.shape[2] - n_kept
     # In torch, which uses the caller's number of threads.
     parts = torch.linalg.svd(torch.from_numpy(C[:, :, n_kept:].copy()), full_matrices=True)
     left, singular, right = (x.numpy() for x in parts)
-    scale = singular.max(-1, keepdims=True, initial=0.0)
-    significant = singular > RANK_TOLERANCE * scale
+    significant = singular > RANK_TOLERANCE * singular.max(-1, keepdims=True, initial=0.0)
     rank = significant.sum(-1)
     lowest, k = int(rank.min(initial=n_rest)) if M else 0, singular.shape[-1]
-    inverse = np.zeros_like(singular)
-    inverse[significant] = 1 / singular[significant]
+    inverse = np.where(significant, 1 / np.where(significant, singular, 1.0), 0.0)
     basis = right.swapaxes(1, 2)
     pseudo_inverse = (basis[:, :, :k] * inverse[:, None]) @ left[:, :, :k].swapaxes(1, 2)
     padded = np.arange(lowest, n_rest) < rank[:, None]
-    T = np.zeros((M, n_z, n_kept + n_rest - lowest))
-    T[:, :n_kept, :n_kept] = np.eye(n_kept)
+    T, Y = np.zeros((M, n_z, n_z - lowest)), np.zeros((M, n_z, n_c))
+    T[:, :n_kept, :n_kept], Y[:, n_kept:] = np.eye(n_kept), pseudo_inverse
     T[:, n_kept:, :n_kept] = -pseudo_inverse @ C[:, :, :n_kept]
     T[:, n_kept:, n_kept:] = basis[:, :, lowest:] * ~padded[:, None]
-    Y_neg = np.zeros((M, n_z, n_c))
-    Y_neg[:, n_kept:] = -pseudo_inverse
     padding = np.concatenate((np.zeros((M, n_kept)), padded), axis=1)
-    return Elimination(T, Y_neg, padding)
+    return Elimination(T, Y, np.zeros((M, 0), np.int64), padding)
 
 
 #: Alternatives for QPs that no solver solves accurately after `eliminate`.
-OTHER_ELIMINATIONS: tuple[Callable[[np.ndarray, int], Elimination | None], ...] = (
-    null_space,
-    in_order,
-)
+OTHER_ELIMINATIONS = null_space, partial(eliminate, threshold=0.0)

@@ -32,13 +32,12 @@ ROUNDING, SIGNIFICANT = 1e-12, 1e-7
 
 def diagnose(programs: Programs) -> np.ndarray:
     """Return the `Status` of each QP, ``(B,)``: INFEASIBLE, UNBOUNDED or NOT_CONVERGED."""
-    H, C, G, q, _, b, lb, ub, w = programs.theta
-    ranges = {m: _Range.of(C[m][:, programs.n_f :]) for m in set(programs.group.tolist())}
-    statuses = []
+    n_f, ranges, statuses = programs.n_f, {}, []
     for i, m in enumerate(programs.group.tolist()):
-        vectors = (x[i % len(x)] for x in (b, lb, ub, w))
-        b_i, lb_i, ub_i, w_i = vectors
-        qp = _FreeQP.of(H[m], q[i % len(q)], C[m], b_i, G[m], lb_i, ub_i, w_i, programs.fixed[i])
+        H, C, G = (x[m % len(x)] for x in programs.theta[:3])
+        q, _, b, *rows = (x[i % len(x)] for x in programs.theta[3:])
+        qp = _FreeQP.of(H, q, C, b, G, *rows, programs.fixed[i])
+        ranges[m] = ranges.get(m) or _Range.of(C[:, n_f:])
         statuses.append(int(_status(qp, ranges[m])))
     return np.array(statuses, np.int64)
 
@@ -52,8 +51,8 @@ class _Range:
 
     @classmethod
     def of(cls, C: np.ndarray) -> _Range:
-        T, Y_neg, _ = null_space(C[None], 0)
-        return cls(-Y_neg[0], T[0])
+        T, Y, *_ = null_space(C[None], 0)
+        return cls(Y[0], T[0])
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def refine(
     if not last and sum(programs.theta.C.shape[1:]) ** 3 > MAX_WORK:
         return
     for i in which:
-        matrices = (x[group[i]] for x in theta[:3])
+        matrices = (x[group[i] % len(x)] for x in theta[:3])
         vectors = (x[i % len(x)] for x in theta[3:])
         qp = _QP._make((*matrices, *vectors, programs.fixed[i]))
         try:

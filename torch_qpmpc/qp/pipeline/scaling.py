@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torch_qpmpc.qp.kernels.linalg import row_sums
 from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 
 #: Sizes between these have the unit one.
@@ -69,7 +70,9 @@ class Units(NamedTuple):
         curvature = np.sqrt(np.abs(theta.H.diagonal(axis1=1, axis2=2)))
         if not (_apart(np.maximum(of_C, of_G)) or _apart(curvature)):
             return None
-        columns = lengths(theta.H, np.concatenate((theta.C, theta.G), axis=1))
+        M = max(map(len, theta[:3]))
+        H, C, G = (x if len(x) == M else x.repeat(M, 0) for x in theta[:3])
+        columns = lengths(H, np.concatenate((C, G), axis=1))
         one = np.ones((len(columns), 1))
         n_c, n_g = theta.C.shape[1], theta.G.shape[1]
         triple = np.arange(len(columns))
@@ -85,9 +88,11 @@ class Units(NamedTuple):
         )
         near, b = np.where(np.isnan(near), 0.0, near), np.abs(theta.b)
         b = np.where(b > ROUNDING * b.max(-1, keepdims=True, initial=0.0), b, 0)
-        reach = np.concatenate((near / rows[group], b / equalities[group]), axis=-1)
+        M = max(map(len, theta[:3]))
         H = column_sizes(theta.H).max(-1, keepdims=True)
-        q = finite_sizes(theta.q, group, len(H)).max(-1, keepdims=True)
+        H, rows, equalities = (x if len(x) == M else x.repeat(M, 0) for x in (H, rows, equalities))
+        reach = np.concatenate((near / rows[group], b / equalities[group]), axis=-1)
+        q = finite_sizes(theta.q, group, M).max(-1, keepdims=True)
         sizes = np.maximum(H, q), rows, equalities, reach
         if (sizes[0] > 0).all() and not any(_unusual(x).any() for x in sizes):
             return None
@@ -112,12 +117,13 @@ class Units(NamedTuple):
     def scaled(self, theta: Theta) -> Theta:
         """Return theta in these units, with the matrices of each class."""
         cost, length, rows, equalities = self.per_qp(self.group)
+        H, C, G = (per_qp(x, self.triple) for x in theta[:3])
         by_row = self.length[:, None] / self.rows[:, :, None]
         by_equality = self.length[:, None] / self.equalities[:, :, None]
         return Theta(
-            theta.H[self.triple] * (self.length[:, :, None] * (self.length / self.cost)[:, None]),
-            theta.C[self.triple] * by_equality,
-            theta.G[self.triple] * by_row,
+            H * (self.length[:, :, None] * (self.length / self.cost)[:, None]),
+            C * by_equality,
+            G * by_row,
             theta.q / (cost / length),
             theta.c / cost[:, 0],
             theta.b / equalities,
@@ -161,11 +167,6 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
         both = np.concatenate((of_H, of_row + units[k, column] + by_row[k, row]))
         units -= _means(of_column, both, M * n).reshape(M, n)
     return np.exp2(np.round(units))
-
-
-def row_sums(matrices: np.ndarray) -> np.ndarray:
-    """Return the sums of the absolute entries of the rows of ``(M, i, j)``."""
-    return np.abs(matrices).sum(-1)
 
 
 def column_sizes(matrices: np.ndarray) -> np.ndarray:

@@ -25,8 +25,8 @@ from torch_qpmpc.qp.pipeline.arrays import (
     SoftQPs,
     to_numpy,
 )
-from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
-from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS, Elimination
+from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, prepared_for
+from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
@@ -36,11 +36,12 @@ from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, 
 #: that ProxQP solves. The last is the same for each: none decides whether there is a solution.
 FALLBACKS = ("daqp", "torch")
 ON_FAILURE = ("raise", "warn", "mask")
-Eliminate = Callable[[np.ndarray, int], Elimination | None]
 #: Rejected solutions with a relative residual up to this are refined.
 NEARLY = 1e-2
 #: Up to this number, rejected QPs are refined one by one; of more, other eliminations come first.
 FEW = 8
+#: So many matrices are condensed at once: more do not fit in the caches.
+TOGETHER = 32
 #: Number of iterative refinements after an alternative elimination.
 PASSES = 2
 
@@ -232,6 +233,12 @@ def solve_programs(
     ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`; a
     ``device`` makes the first attempt.
     """
+    if (count := max(map(len, programs.theta[:3]))) > TOGETHER:
+        solution = programs.unsolved(Status.NOT_CONVERGED)
+        for index in np.array_split(programs.group.argsort(kind="stable"), -(-count // TOGETHER)):
+            own = None if start is None else start[index]
+            solution.put(index, solve_programs(programs.take(index), solver, own, device))
+        return solution
     began, log = time.perf_counter(), _active_log.get(unused := SolveLog())
     steps = steps_of(solver, log, start is not None, device)
     if (units := programs.prepared.units) is None:
@@ -351,12 +358,14 @@ def _if_few(step: Step, programs: Programs, best: BatchSolution) -> BatchSolutio
     return step(programs, best) if len(programs) <= FEW else best
 
 
-def _eliminated(eliminate: Eliminate, programs: Programs, best: BatchSolution) -> BatchSolution:
+def _eliminated(eliminate: Any, programs: Programs, best: BatchSolution) -> BatchSolution:
     """Solve with another elimination of C z = b, if it applies."""
-    C = programs.theta.C
-    if not C.size or (elimination := eliminate(C, programs.n_f)) is None:
+    prepared, C = Prepared(programs.theta, programs.prepared.group, programs.n_f), programs.theta.C
+    prepared.elimination = eliminate(C, programs.n_f) if C.size else None
+    if prepared.elimination is None or not np.isfinite(prepared.elimination.T).all():
         return best
-    return backed(BACKENDS["torch"], PASSES)(programs.eliminated(elimination), best)
+    other = Programs(prepared, programs.group, programs.fixed)
+    return backed(BACKENDS["torch"], PASSES)(other, best)
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:
