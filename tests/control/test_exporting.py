@@ -266,9 +266,25 @@ def test_a_self_test_replays_the_steps_whose_inputs_rounding_hardly_changes(tmp_
     assert load(files, controller).selftest() == 0
 
 
-def test_a_controller_that_disagrees_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setitem(exporting.NEAR, "float64", -1.0)
-    with pytest.raises(QPError, match=r"dtype: got 'float64', with a failed self-test \(3\)"):
+@pytest.mark.parametrize(
+    ("off", "code", "failed", "match"),
+    [
+        (0.0, 1, 0, "no plan of C's in step 3 of a loop, where Python has one, expected C that"),
+        (1e-3, 0, 0, r"inputs of a loop off by \[.*Python. The cost on the plan has condition"),
+        (0.0, 0, 3, r"a failed self-test \(3\), expected C that agrees with Python"),
+    ],
+)
+def test_a_controller_that_disagrees_is_refused(off, code, failed, match, tmp_path, monkeypatch):
+    step, count, own = exporting.CompiledController.step, iter(range(1000)), {"raising": False}
+
+    def wrong(*arguments):
+        u, found = step(*arguments)
+        return (u + off, code) if next(count) == 3 else (u, found)
+
+    selftest = property(lambda _: lambda: failed, lambda *_: None)
+    monkeypatch.setattr(exporting.CompiledController, "step", wrong)
+    monkeypatch.setattr(exporting.CompiledController, "selftest", selftest, **own)
+    with pytest.raises(QPError, match=f"dtype: got 'float64', with {match}"):
         qm.Controller(integrator()).export_c(tmp_path)
     assert not [*tmp_path.iterdir()]
 

@@ -177,6 +177,35 @@ def test_states_are_drawn_about_a_feasible_one(tmp_path):
         assert 0 < agreement.u < 1e-8
 
 
+def test_infeasible_states_are_moved_to_the_edge_of_the_feasible_ones_at_once():
+    moves = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.2, 0.2), "y_bounds": (-1.0, 1.0)}
+    A, B = [[0.9, 0.3], [-0.2, 0.7]], [[0.4, 0.1], [0.2, 0.5]]
+    mpc = qm.LinearMPC((A, B), 5, Q=1.0, dR=0.1, **moves).plan
+    tables = make_tables(mpc)
+    with qm.SolveLog() as log:
+        p, exact = comparison.states(mpc, tables, "float64")
+    assert log.solves < 1.2 * len(p)
+    solved = exact.status == Status.SOLVED
+    assert solved.sum() > len(p) / 2
+    moved = solved & (np.abs(p - draw(tables, len(p))) > 1e-9).any(1)
+    assert moved.sum() > len(p) / 4
+    assert (moved[::4] == 0).all()
+    further = comparison.reference(mpc, 2 * p[moved] - tables.centre)
+    assert (further.status == Status.INFEASIBLE).all()
+
+
+def test_a_loose_solution_is_replaced_before_it_is_refined():
+    mpc = shifted()
+    p = draw(make_tables(mpc), 12)
+    best = comparison.reference(mpc, p)
+    solved = np.flatnonzero(best.status == Status.SOLVED)
+    assert len(solved) > 5
+    loose = best._replace(z=0 * best.z, lam=0 * best.lam, value_error=best.value_error + 1e-7)
+    got = comparison.sharpen(mpc, p, loose, solved)
+    expected = comparison.actions(mpc, best)[solved]
+    np.testing.assert_allclose(comparison.actions(mpc, got)[solved], expected, atol=1e-7)
+
+
 @pytest.mark.parametrize("ends", [(-0.5, 3e9), (-2e8, 5e7), (-4e16, 0.5), (0.0, 7e11)])
 def test_a_bound_that_cannot_act_draws_the_states_of_none(ends, tmp_path):
     def bounded(ends: tuple[float, float]) -> QPMPC:

@@ -71,6 +71,20 @@ def test_hard_rows_that_no_plan_satisfies_are_infeasible(tmp_path):
     assert (np.abs(cold.u) <= 1).all()
 
 
+def test_a_soft_row_at_its_bound_is_certified_whatever_its_price(tmp_path):
+    """A price times the rounding of a row is large beside the value."""
+    D, most = [[0.0, 0.0, 1.0], [1.0, 0.3, 0.2]], torch.tensor([0.3, 0.7])
+    options = {"stage_weight": [1.0, 1.0, 0.1], "constraints": (D, -most, most)}
+    A, B = [[0.9, 0.2], [0.0, 0.8]], [[0.1], [1.0]]
+    mpc = QPMPC.from_model(A, B, 4, constraint_slack=1e8, **options)
+    library, _ = load(mpc, tmp_path)
+    p = np.random.default_rng(0).normal(size=(300, 2))
+    steps, exact = library.steps(library.states(300), p, 1), reference(mpc, p, "torch")
+    assert (steps.codes == SOLVED).all()
+    np.testing.assert_allclose(steps.u, actions(mpc, exact), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(steps.value, exact.value, rtol=1e-6)
+
+
 def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost(tmp_path):
     def scheme(slack: float) -> QPMPC:
         bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": slack}

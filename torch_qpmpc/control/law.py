@@ -447,7 +447,6 @@ class Law:
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""
-
         law = self
 
         def policy(signals: Signals) -> Move:

@@ -5,10 +5,10 @@ Where policy and solver differ, the solution is refined in twice the working pre
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # imports scipy.optimize at its first use: a third of a second
 import torch
 
 from torch_qpmpc.errors import QPError
@@ -33,7 +33,7 @@ DOUBTFUL = 1e-9
 EACH = 3
 #: A centre that is nearer to a bound, relative to the distance of both, is at that bound.
 CENTRED = 1e-6
-#: Most times that an infeasible state is moved half way to the centre.
+#: Most times that the distance of an infeasible state to the centre is halved.
 HALVINGS = 12
 #: What a step of an infeasible state returns.
 INFEASIBLE = 2
@@ -96,22 +96,32 @@ def _is_large(qps: Programs) -> bool:
 
 
 def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
-    """Refine the solutions of ``coarse`` at the indices ``which``."""
+    """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose."""
     qps, exact = programs(mpc, p, coarse.z), coarse.at(np.arange(len(p)))
+    if len(loose := which[exact.value_error[which] > DOUBTFUL]) and mpc.levels is None:
+        exact.put(loose, reference(mpc, p[loose], "torch"))
     if len(which) and not _is_large(qps):
         refine(qps, exact, which, last=True)
     return exact if mpc.levels is None else exact._replace(value=coarse.value)  # has starts
 
 
 def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution]:
-    """Draw states in the policy's numbers, most of which have solutions, and solve for them."""
+    """Draw states in the policy's numbers, most of which have solutions, and solve for them.
 
-    def solve(p: Array) -> BatchSolution:
-        return reference(mpc, p.astype(dtype).astype(np.float64))
-
+    Of four infeasible ones three are halved in their distance to the centre until they have one:
+    the p with a plan are a convex set.
+    """
     count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2) * (not mpc.levels)
-    p, exact = nearer(tables, draw(tables, max(count, min(LEAST, COMPARED))), solve)
-    return p.astype(dtype).astype(np.float64), exact
+    away = draw(tables, max(count, min(LEAST, COMPARED))) - tables.centre
+    few, halved = np.arange(len(away)) % 4 > 0, np.zeros(len(away))
+    halved[few] = np.ceil(-np.log2(reaches(tables, away[few])))
+    p = (tables.centre + away * 0.5 ** halved[:, None]).astype(dtype).astype(np.float64)
+    exact = reference(mpc, p)
+    while (moved := few & (exact.status == Status.INFEASIBLE) & (halved < HALVINGS)).any():
+        halved += moved
+        p[moved] = ((p[moved] + tables.centre) / 2).astype(dtype)
+        exact.put(moved, reference(mpc, p[moved]))
+    return p, exact
 
 
 def draw(tables: Tables, count: int, seed: int = 0) -> Array:
@@ -149,22 +159,26 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     return p - (p @ Y.T - known.lower[equal]) @ np.linalg.pinv(Y).T
 
 
-def nearer(
-    tables: Tables, p: Array, solve: Callable[[Array], BatchSolution]
-) -> tuple[Array, BatchSolution]:
-    """Draw infeasible p nearer to the centre until they have solutions, and solve for all p.
+def reaches(tables: Tables, away: Array) -> Array:
+    """Return how far, at most 1, a plan keeps the hard rows on the ways ``away`` from the centre.
 
-    The p with a plan are a convex set. One infeasible p in four stays what it is.
+    It is 1, too, where a linear program is not solved.
     """
-    p, exact = p.copy(), solve(p)
-    for _ in range(HALVINGS):
-        infeasible = np.flatnonzero(exact.status == Status.INFEASIBLE)
-        moved = infeasible[infeasible % 4 > 0]
-        if not len(moved):
-            break
-        p[moved] = (p[moved] + tables.centre) / 2
-        exact.put(moved, solve(p[moved]))
-    return p, exact
+    pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
+    Y, lower, upper, w, *_ = map(np.concatenate, pairs)
+    at, R = Y @ tables.centre, np.pad(tables.R, ((0, len(tables.known)), (0, 0)))
+    room, Y, R = np.append(upper - at, at - lower), np.vstack((Y, -Y)), np.vstack((R, -R))
+    acts = np.isfinite(room) & np.tile(np.isinf(w), 2)
+    if not acts.any():
+        return np.ones(len(away))
+    room, Y, R, found = room[acts], Y[acts], R[acts], []
+    size = np.median(np.abs(room)) or 1.0
+    cost, ends = -np.eye(1, R.shape[1] + 1)[0], [(0, 1), *[(None, None)] * R.shape[1]]
+    for way in away:
+        rows = np.column_stack((Y @ way / size, R))
+        best = scipy.optimize.linprog(cost, rows, room / size, bounds=ends)
+        found.append(1.0 if best.x is None else best.x[0])
+    return np.maximum(found, 0.5**HALVINGS)
 
 
 def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, BatchSolution]:

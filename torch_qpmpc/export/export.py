@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import torch
@@ -20,7 +21,6 @@ from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import NEAR, REAL, Settings, header, sources, table_bytes
 from torch_qpmpc.mpc.module import QPMPC
 
-STORAGES = ("fast", "small")
 #: Largest share of the solvable states that may be uncertified.
 UNSOLVED = 0.1
 #: The default limit of iterations is ``PER_ROW r + AT_LEAST``.
@@ -130,9 +130,8 @@ def export_c(
         folder.mkdir(parents=True, exist_ok=True)
         for file in export.files:
             (folder / file.name).unlink(missing_ok=True)  # may be a link, which copy would follow
-        return replace(
-            export, files=tuple(Path(shutil.copy(file, folder)) for file in export.files)
-        )
+        copies = (Path(shutil.copy(file, folder)) for file in export.files)
+        return replace(export, files=tuple(copies))
 
 
 def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Library | None]:
@@ -140,9 +139,7 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
     name, dtype, storage, limit = settings
     _check(mpc, settings)
     tables = make_tables(mpc)
-    settings = settings._replace(
-        max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST,
-    )
+    settings = settings._replace(max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST)
     p, exact = states(mpc, tables, dtype)
     examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings), examples)
@@ -154,52 +151,51 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
         agreement, error = compare(mpc, tables, library, p, exact)
         solvable, unsolved = agreement.solved + agreement.unsolved, agreement.unsolved
         if limit is None and unsolved > UNSOLVED * solvable:
-            _refuse(dtype, f"{unsolved} of {solvable} states not certified", tables)
+            refuse(dtype, f"{unsolved} of {solvable} states not certified", tables)
         if not agreement.solved:
             got = f"{limit}, with none of {solvable} states solved"
             remedy = "Raise it, or leave it out."
             raise QPError.expected("max_iterations", got, "a limit that solves some", remedy)
         if not error <= NEAR[dtype].u:
-            _refuse(dtype, f"an action off by {error:.1e} of its size", tables)
+            refuse(dtype, f"an action off by {error:.1e} of its size", tables)
         if failed := library.selftest():
             kinds = [*(example.kind for example in examples.states), "invalid"]
-            _refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
+            refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
     elif dtype == "float32":
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
     own = "some" if library is None else str(library.state_bytes)
     for file, text in texts.items():
         (folder / file).write_text(text.replace("@BYTES@", own), encoding="utf-8")
+    sizes = {"n_p": tables.n_p, "n_u": tables.n_u, "rows": len(tables.rows)}
+    sizes |= {"variables": tables.R.shape[1], "table_bytes": table_bytes(tables, settings)}
     export = Export(
         files=tuple(folder / file for file in texts),
         dtype=dtype,
         storage=storage,
         max_iterations=settings.max_iterations or 0,
-        n_p=tables.n_p,
-        n_u=tables.n_u,
-        rows=len(tables.rows),
-        variables=tables.R.shape[1],
-        table_bytes=table_bytes(tables, settings),
         state_bytes=None if library is None else library.state_bytes,
         condition=tables.condition,
         agreement=agreement,
         digest=tables.digest,
+        **sizes,
     )
     return export, library
 
 
-def _refuse(dtype: str, got: str, tables: Tables) -> None:
+def refuse(dtype: str, got: str, of: Tables | Export) -> NoReturn:
+    """Raise `QPError`: the C of a plan does not agree with Python."""
     remedy = "Export float64."
     if dtype == "float64":
-        cost = f"The cost on the plan has condition {tables.condition:.1e}"
+        cost = f"The cost on the plan has condition {of.condition:.1e}"
         remedy = f"{cost}: lower slack weights (y_slack), shorten the horizon, or rescale states."
-    raise QPError.expected("dtype", f"{dtype!r}, with {got}", "a policy that agrees", remedy)
+    raise QPError.expected("dtype", f"{dtype!r}, with {got}", "C that agrees with Python", remedy)
 
 
 def _check(mpc: QPMPC, settings: Settings) -> None:
     check_kind("mpc", mpc, QPMPC)
     check_choice("dtype", settings.dtype, tuple(REAL))
-    check_choice("storage", settings.storage, STORAGES)
+    check_choice("storage", settings.storage, ("fast", "small"))
     check_name(settings.name)
     if settings.max_iterations is not None:
         check_whole("max_iterations", settings.max_iterations, 1)

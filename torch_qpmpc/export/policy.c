@@ -388,7 +388,8 @@ static int certify(const policy_state *s, real v_free, policy_info *info)
     for (i = 0; i < POLICY_ROWS; i++) sum += absolute(s->lambda[i]);
     for (i = 0; i < POLICY_ROWS; i++) {
         real y = s->y[i], lambda = s->lambda[i], off = distance(y, LOW(i), HIGH(i));
-        real charge = W[i] < BIG ? W[i] * off : 0;
+        real rounding = TIGHT * terms_of(s, i, y - HIGH(i)) + ROUNDING * sum; /* as in worst */
+        real charge = W[i] < BIG && off > rounding ? W[i] * off : 0;
         if (W[i] >= BIG) {
             info->violation = larger(info->violation, off * UNIT[i]);
             if (!(off <= FEASIBLE * terms_of(s, i, y - HIGH(i)) + ROUNDING * sum)) holds = 0;

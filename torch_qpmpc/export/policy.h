@@ -45,7 +45,7 @@ typedef struct {
 
 typedef struct {
     policy_real value;     /* cost to go, c included */
-    policy_real gap;       /* bound on value minus the optimal value */
+    policy_real gap;       /* bound on value minus the optimal value, up to rounding */
     policy_real violation; /* largest violation of a hard row, in the units of the row */
     int iterations;        /* changes of the active set */
 } policy_info;

@@ -36,7 +36,7 @@ _CONSTANTS = {
     "KNOWN_FEASIBLE": ("1e-6", "1e-5f"),
     "GAP": ("1e-9", "1e-4f"),
     "GAIN": ("1e-13", "1e-6f"),
-    "COARSE": ("1e-7", "1e-4f"),
+    "COARSE": ("1e-6", "1e-4f"),
 }
 REAL = {"float64": "double", "float32": "float"}
 #: Tolerances by dtype, of which `torch_qpmpc/export/policy.c` explains the use.
@@ -152,20 +152,11 @@ def factored(tables: Tables, settings: Settings) -> bool:
 def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
     """Return the sizes in the header, by the macro's name without the prefix."""
     r, d, most = len(tables.rows), tables.R.shape[1], held(tables)
-    sizes = {
-        "N_P": tables.n_p,
-        "N_U": tables.n_u,
-        "ROWS": r,
-        "ROWS_": max(r, 1),
-        "KNOWN": len(tables.known),
-        "D": d,
-        "HELD": most,
-        "HELD_": max(most, 1),
-        "TRIANGLE": max(most * (most + 1) // 2, 1),
-        "FACTORED": int(factored(tables, settings)),
-        "WORK": d if factored(tables, settings) else 0,
-        "LEVELS": 0,
-    }
+    small = factored(tables, settings)
+    sizes = {"N_P": tables.n_p, "N_U": tables.n_u, "ROWS": r, "ROWS_": max(r, 1)}
+    sizes |= {"KNOWN": len(tables.known), "D": d, "HELD": most, "HELD_": max(most, 1)}
+    sizes |= {"TRIANGLE": max(most * (most + 1) // 2, 1), "FACTORED": int(small)}
+    sizes |= {"WORK": d * small, "LEVELS": 0}
     if tables.decisions:
         levels, (m, S) = tables.decisions.levels, tables.decisions.rows.shape
         sizes |= {"LEVELS": m, "DECIDED": S, "DECISIONS": m * S, "NODES": levels.max_nodes}
