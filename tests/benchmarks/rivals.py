@@ -1,9 +1,10 @@
 """`improve` and Q-learning beside classical designs: ``python -m tests.benchmarks.rivals``.
 
-Four plants with a bounded input, hidden states and an asymmetric cost. On Dosing and Balance the
-noise grows with state and action in a way that no design knows; Pipe has a dead time, and Sine
-is Balance with the sine of a real pole, and constant noise. Each design knows the log, the cost and
-the input's bounds, and nothing else of the plant:
+Seven plants with a bounded input, hidden states and an asymmetric cost. On Dosing and Balance the
+noise grows with state and action in a way that no design knows; the noise of the others is
+constant. Sine is Balance with the sine of a real pole, Pipe has a dead time, Masses are two with a
+spring, Tails is Dosing with heavy-tailed noise, and Deadband a drift that small inputs do not move.
+Each design knows the log, the cost and the input's bounds, and nothing else of the plant:
 
 - ``mean``: MPC with the identified model and filter.
 - ``moved``: the same, aimed beyond the set-point by as much as pays for the closed loop's noise.
@@ -11,7 +12,7 @@ the input's bounds, and nothing else of the plant:
   (de Koning, Automatica 1982), clipped to the bounds.
 - ``two numbers``: ``mean`` with the set-point and the input's weight of least cost in simulated
   loops of the identified, noisy models.
-- ``improve``: theta by gradients through the same loops, from ``mean``.
+- ``improve``: q and the soft bound by gradients through the same loops, from ``mean``.
 - ``Q-learning``: half of the transitions are its log, and it collects the others.
 
 J is the mean cost of a step in 1,000 loops of the plant, drawn for each seed, four times as long as
@@ -47,6 +48,7 @@ from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
 from torch_qpmpc.experiment.tasks import Task, plant_layout, register
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
+from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
 from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "rivals.csv"
@@ -167,8 +169,53 @@ class Sine(Balance):
         return torch.cat((y + 0.1 * v, after), -1)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Masses(Balance):
+    """Two masses with a spring, x = [positions, velocities]; u pushes one, y is the other."""
+
+    A: Tensor = field(
+        default_factory=float64(
+            [1, 0, 0.1, 0], [0, 1, 0, 0.1], [-0.2, 0.2, 0.98, 0.02], [0.2, -0.2, 0.02, 0.98]
+        )
+    )
+    B: Tensor = field(default_factory=float64([0], [0], [0], [0.1]))
+
+    def starts(self, rng, count):
+        return torch.nn.functional.pad((uniform(rng, count, 1) - 0.5) * 0.4, (0, 1)).repeat(1, 2)
+
+    def step(self, x, u, w):
+        return x @ self.A.mT + u @ self.B.mT + 0.01 * torch.nn.functional.pad(w[..., :2], (2, 0))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tails(Dosing):
+    """Dosing with constant noise of Student's t, of three degrees of freedom."""
+
+    def signals(self, rng, count, length):
+        w = normal(rng, count, length, 9)
+        spread = (w[..., 3:].unflatten(-1, (2, 3)).square().mean(-1)).sqrt()
+        return torch.cat((w[..., :2] / spread, w[..., 2:3]), -1)
+
+    def step(self, x, u, w):
+        noise = torch.cat((0.02 * w[..., :1], 0.05 * w[..., 1:2]), -1)
+        return x @ self.A.mT + u @ self.B.mT + noise
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Deadband(Balance):
+    """A drifting position, x = [y, velocity], on which inputs below 0.15 do not act."""
+
+    A: Tensor = field(default_factory=float64([1, 0.1], [0, 0.9]))
+
+    def step(self, x, u, w):
+        acting = u - u.clamp(-0.15, 0.15)
+        noise = torch.nn.functional.pad(0.03 * w[..., 1:2], (1, 0))
+        return x @ self.A.mT + acting @ self.B.mT + noise
+
+
 PLANTS: dict[str, Priced] = {
-    plant.__class__.__name__: plant for plant in (Dosing(), Balance(), Pipe(), Sine())
+    plant.__class__.__name__: plant
+    for plant in (Dosing(), Balance(), Pipe(), Sine(), Masses(), Tails(), Deadband())
 }
 
 
@@ -193,7 +240,14 @@ def scheme(plant: Any, model: qm.Model, gamma: float, moved: float, effort: floa
         soft = {"state_bounds": (lower, torch.full_like(lower, math.inf)), "state_slack": p.price}
     bounds = qm.Bounds(action_bounds=(plant.lb_a, plant.ub_a), discount_slack=True, **soft)
     q = q.repeat(HORIZON + 1)[: layout.n_z]
-    cost = qm.Cost(torch.diag(weight), torch.diag(weight[:-1]), hessian="block", q=q)
+    W, last = torch.diag(weight), torch.diag(weight[:-1])
+    if model.A is not None:  # the cost to go of the regulator about r
+        A, B, offset, aim = model.A, model.B, model.offset, torch.zeros_like(weight)
+        aim[0] = -weight[0] * r
+        last = riccati_weight(A, B, W, gamma)
+        end, _ = affine_cost_to_go(A, B, offset, W, aim, last, gamma)
+        q[-layout.n_x :] = end + p.slope * (torch.arange(layout.n_x) == 0)
+    cost = qm.Cost(W, last, hessian="block", q=q)
     return qm.Scheme(layout, model, cost, bounds, gamma)
 
 
@@ -202,7 +256,7 @@ def designed(plant: Priced, found: Identified, moved: float = 0.0, effort: float
     m = found.model
     model = qm.Model(*(torch.tensor(x) for x in (m.A, m.B, m.E, m.offset)))
     made = scheme(plant.observed(m), model, 1.0, moved, effort)
-    learn = ("H", "H_f", "q", "b", *(("lb",) if plant.price.price else ()))
+    learn = ("q", *(("lb",) if plant.price.price else ()))
     return qm.QPMPC(made, learn=learn, structure="tied", solver="daqp")
 
 
