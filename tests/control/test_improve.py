@@ -139,7 +139,6 @@ def test_it_stays_away_from_a_bound_that_noise_violates():
     assert 0 <= controller.step(y={"T": 20.5}, r={"T": 20.9}, known=NOW)["q"] <= 10
 
 
-@pytest.mark.xfail(strict=True, reason="H moves by products with prices and limits")
 def test_the_outputs_still_settle_at_r():
     """What would move the steady state is held, and the report says so; r is held in loops, too."""
     controller = made("bounds", learn=("H", "H_f", "q", "b"))

@@ -293,15 +293,19 @@ def improve(
 def steady(design: Design, plan: QPMPC) -> dict[str, Tensor]:
     """Return the masks of the coordinates of theta that may move; others may as a whole.
 
-    At rest all signals of a stage are zero but the constants at the end of its state, which place
-    the bounds. Its plan stays zero if no cost and no prediction depends on them.
+    At rest all signals of a stage are zero but the known ones that do not act on the plant, such as
+    prices, and the constants at the end of its state, which place the bounds. Its plan stays zero
+    if no cost and no prediction depends on them.
     """
     layout, constants = plan.layout, design.places["one"].stop - design.places["off"].start
-    fixed = torch.arange(plan.n_x) >= plan.n_x - constants
-    stage = F.pad(fixed, (plan.n_d, plan.n_u))
-    of_z = F.pad(layout.stages(fixed, fixed.new_zeros(plan.n_u)), (layout.n_preview, 0))
-    moves, none = ~fixed[:, None], torch.zeros(1, dtype=torch.bool)
-    masks = {"H": stage[:, None] == stage, "A": moves & ~fixed, "B": moves, "E": moves}
+    fixed, none = torch.zeros(plan.n_d + plan.n_x, dtype=torch.bool), torch.zeros(1).bool()
+    fixed[len(fixed) - constants :] = True
+    fixed[design.places["known"]] = ~torch.as_tensor(design.acts)
+    of_d, of_x = fixed.split([plan.n_d, plan.n_x])
+    stage = F.pad(fixed, (0, plan.n_u))
+    ahead = layout.stages(of_x, of_x.new_zeros(plan.n_u))
+    of_z, moves = torch.cat((of_d.repeat(plan.horizon + 1), ahead)), ~of_x[:, None]
+    masks = {"H": stage[:, None] == stage, "A": moves & ~of_x, "B": moves, "E": moves & ~of_d}
     masks["H_f"] = masks["H"][: -plan.n_u, : -plan.n_u]
     return masks | {"C": moves.repeat(plan.horizon, 1) & ~of_z, "q": none, "b": none}
 
