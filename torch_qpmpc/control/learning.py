@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
@@ -293,19 +292,16 @@ def improve(
 def steady(design: Design, plan: QPMPC) -> dict[str, Tensor]:
     """Return the masks of the coordinates of theta that may move; others may as a whole.
 
-    At rest all signals of a stage are zero but the known ones that do not act on the plant, such as
-    prices, and the constants at the end of its state, which place the bounds. Its plan stays zero
-    if no cost and no prediction depends on them.
+    At rest all signals of a stage are zero but constants, which place the bounds, and known ones
+    that do not act on the plant. The plan stays zero if no cost and no prediction depends on them.
     """
-    layout, constants = plan.layout, design.places["one"].stop - design.places["off"].start
-    fixed, none = torch.zeros(plan.n_d + plan.n_x, dtype=torch.bool), torch.zeros(1).bool()
-    fixed[len(fixed) - constants :] = True
-    fixed[design.places["known"]] = ~torch.as_tensor(design.acts)
-    of_d, of_x = fixed.split([plan.n_d, plan.n_x])
-    stage = F.pad(fixed, (0, plan.n_u))
-    ahead = layout.stages(of_x, of_x.new_zeros(plan.n_u))
-    of_z, moves = torch.cat((of_d.repeat(plan.horizon + 1), ahead)), ~of_x[:, None]
-    masks = {"H": stage[:, None] == stage, "A": moves & ~of_x, "B": moves, "E": moves & ~of_d}
+    s, layout, none = design.selectors(), plan.layout, torch.zeros(1, dtype=torch.bool)
+    zero = np.vstack([s[name] for name in ("r", "u_r", "x", "u_last", "u")])
+    fixed = torch.as_tensor(~np.vstack((zero, s["known"][design.acts])).any(0))
+    of_d, of_x, of_u = fixed.split([plan.n_d, plan.n_x, plan.n_u])
+    of_z = torch.cat((of_d.repeat(plan.horizon + 1), layout.stages(of_x, of_u)))
+    moves = ~of_x[:, None]
+    masks = {"H": fixed[:, None] == fixed, "A": moves & ~of_x, "B": moves, "E": moves & ~of_d}
     masks["H_f"] = masks["H"][: -plan.n_u, : -plan.n_u]
     return masks | {"C": moves.repeat(plan.horizon, 1) & ~of_z, "q": none, "b": none}
 
