@@ -34,7 +34,7 @@ BUDGET = {
     "experiment": 2886,
     "export": 1500,
     "learning": 2833,  # models that did not train theta decide in improve
-    "identification": 2638,
+    "identification": 2641,
     "mpc": 3895,
     "proofs": 1001,
     "qp": 5513,

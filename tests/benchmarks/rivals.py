@@ -13,6 +13,7 @@ Each design knows the log, the cost and the input's bounds, and nothing else of 
 - ``two numbers``: ``mean`` with the set-point and the input's weight of least cost in simulated
   loops of the identified, noisy models.
 - ``improve``: q and the soft bound by gradients through the same loops, from ``mean``.
+- ``improve, H``: the weights, too.
 - ``Q-learning``: half of the transitions are its log, and it collects the others.
 
 J is the mean cost of a step in 1,000 loops of the plant, drawn for each seed, four times as long as
@@ -251,12 +252,18 @@ def scheme(plant: Any, model: qm.Model, gamma: float, moved: float, effort: floa
     return qm.Scheme(layout, model, cost, bounds, gamma)
 
 
-def designed(plant: Priced, found: Identified, moved: float = 0.0, effort: float = 1.0) -> qm.QPMPC:
+def designed(
+    plant: Priced,
+    found: Identified,
+    moved: float = 0.0,
+    effort: float = 1.0,
+    learn: tuple[str, ...] = ("q",),
+) -> qm.QPMPC:
     """Return MPC of the estimate by an identified model, without discount."""
     m = found.model
     model = qm.Model(*(torch.tensor(x) for x in (m.A, m.B, m.E, m.offset)))
     made = scheme(plant.observed(m), model, 1.0, moved, effort)
-    learn = ("q", *(("lb",) if plant.price.price else ()))
+    learn = (*learn, *(("lb",) if plant.price.price else ()))
     return qm.QPMPC(made, learn=learn, structure="tied", solver="daqp")
 
 
@@ -394,7 +401,9 @@ def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Any]:
         return qm.load_run(folder).policy, qm.identify(log, HORIZON).fit.model
 
 
-DESIGNS = ("mean", "Riccati", "moved", "two numbers", "improve", "Q-learning")
+DESIGNS = ("mean", "Riccati", "moved", "two numbers", "improve", "improve, H", "Q-learning")
+#: What the designs by gradients learn, besides soft bounds.
+LEARNED = {"improve": ("q",), "improve, H": ("q", "H", "H_f")}
 
 
 def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -417,8 +426,9 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
         elif design == "two numbers":
             models = simulated_plant(found, price, HORIZON, seed=seed)
             policy = tuned(plant, found, models, known.std, seed).policy
-        elif design == "improve":
-            options: Any = {"updates": 60, "steps": STEPS, "seed": seed}
+        elif design in LEARNED:
+            mpc = designed(plant, found, learn=LEARNED[design])
+            policy, options = mpc.policy, {"updates": 60, "steps": STEPS, "seed": seed}
             kept = qm.improve(mpc, found, cost=price, **options).kept
         elif design == "Q-learning":
             mpc, model = q_learning(name, size, seed)

@@ -123,6 +123,9 @@ def test_longer_steps_raise_the_likelihood_faster():
     values = [likelihood(em(start, data, count, 1.2), data) for count in (0, 5, 10, 20, 30)]
     assert np.all(np.diff(values) > 0)
     assert values[-1] > likelihood(em(start, data, 30), data) + 4
+    gained = values[-1] - values[0]
+    assert em(start, data, 30, 1.2, 1.01 * gained / 300) is start
+    assert em(start, data, 30, 1.2, 0.99 * gained / 300) is not start
 
 
 def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken(monkeypatch):

@@ -95,29 +95,33 @@ def smooth(par: Noisy, group: Group) -> Smoothed:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of leaps that diverge
-def em(par: Noisy, data: Sequence[Signals], iterations: int, growth: float = 1.0) -> Noisy:
-    """Raise the likelihood by expectation maximisation.
+def em(
+    par: Noisy, data: Sequence[Signals], iterations: int, growth: float = 1.0, gain: float = 0.0
+) -> Noisy:
+    """Raise the likelihood by expectation maximisation, if it gains as much as ``gain`` by a row.
 
     With a ``growth`` above 1, steps are lengthened by a factor that grows so in each (Salakhutdinov
     and Roweis 2003); from one that lowers the likelihood it returns, and the factor is 1 again.
     """
     groups, steps = groups_of(data), sum(len(y) for y, _ in data)
-    before, last, plain, factor = -np.inf, par, par, 1.0
+    before, least, first, last, plain, factor = -np.inf, -np.inf, par, par, par, 1.0
     for _ in range(iterations):
         moments = [smooth(par, group) for group in groups]
         value = sum(m.likelihood for m in moments) / steps
+        least = value + gain if par is first else least
         if par is not plain and not value >= before + STALLED:
             par, factor = plain, 1.0
             continue
         if not value - before >= STALLED:
-            return plain if np.isfinite(value) else last
+            plain = plain if np.isfinite(value) else last
+            break
         before, last, plain = value, par, _maximise(groups, moments)
         factor, par = factor * growth, plain
         if factor > 1:
             far = Noisy(*(x + factor * (z - x) for x, z in zip(last, plain, strict=True)))
             parts = {"Q": FLOOR_Q, "R": FLOOR_R, "P0": FLOOR_Q}
             par = far._replace(**{k: _positive(getattr(far, k), w) for k, w in parts.items()})
-    return plain
+    return plain if before >= least else first
 
 
 def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:

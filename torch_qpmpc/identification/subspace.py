@@ -34,8 +34,9 @@ from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.ridge import ridge
 
 #: Iterations of expectation maximisation, of a candidate and of the fit; and the further ones, of
-#: steps that grow by a factor, of a fit that predicts the last horizon as well with them.
-FEW, SOME, MANY, GROWTH = 5, 10, 200, 1.2
+#: steps that grow by a factor, of a fit that predicts the last horizon as well with them, and gains
+#: so much likelihood by a row: less is often noise that is not constant, not a better model.
+FEW, SOME, MANY, GROWTH, GAIN = 5, 10, 200, 1.2, 0.1
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
 HIDDEN = 1e-2
@@ -122,7 +123,7 @@ def fit_state_space(
     model = measured(data, filled)
     if order:
         par = em(_states(_predictor(filled, lags), order), data, SOME)
-        likely, held = em(par, data, MANY, GROWTH), _Held(trajectories)
+        likely, held = em(par, data, MANY, GROWTH, GAIN), _Held(trajectories)
         some, many = map(steady, (par, likely))
         far = [_far(one, data, held) for one in (some, many)]
         model = readable(many if far[1] <= far[0] else some, data)
