@@ -128,8 +128,8 @@ def test_longer_steps_raise_the_likelihood_faster():
     assert em(start, data, 30, 1.2, 0.99 * gained / 300) is not start
 
 
-def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken(monkeypatch):
-    """One of two states, of a plant with three: the likeliest is right one step ahead."""
+def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken():
+    """One of two states, of a plant with three: the likeliest is off by 0.4 far ahead."""
     rng, x, A = np.random.default_rng(0), np.zeros(3), scipy.linalg.block_diag(np.eye(2), 0.6)
     A[:2] = [[0.98, 0.1, 0], [-0.1, 0.95, 0.1]]
     y, u = np.zeros((501, 1)), rng.uniform(-1, 1, (500, 1))
@@ -137,9 +137,7 @@ def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken(monkeypatch
         y[k] = x[0] + 1e-3 * rng.normal()
         x = A @ x + [0, 0.2, 1] * u[min(k, 499)] + [0, 0, 0.03] * rng.normal(size=3)
     log = {"y": y, "u": u}
-    found = qm.identify(log, order=2)
-    monkeypatch.setattr(subspace, "MANY", 0)
-    assert off(found, log) < 1.02 * off(qm.identify(log, order=2), log)
+    assert off(qm.identify(log, order=2), log) < 0.1
 
 
 @pytest.mark.parametrize("n_y", [1, 2])
