@@ -83,7 +83,8 @@ PLANTS = {
 for name, known in CONVERSE.items():
     id = f"Converse{name.partition('-')[0]}-v0"
     if id not in gymnasium.registry:  # this module is __main__, too
-        gymnasium.register(id, partial(Converse, name), max_episode_steps=known.steps)
+        make: Any = partial(Converse, name)
+        gymnasium.register(id, make, max_episode_steps=known.steps)
     more = (f"task.gamma={known.gamma}", "task.episode_steps=5")
     outside.PLANTS[name] = outside.Outside(f"{HERE}:{id}", "gymnasium", None, more)
 
@@ -191,12 +192,13 @@ def agent(name: str, id: str, seed: int, count: int) -> Callable[[Tensor], Tenso
     sizes: Any = {"num_cells": [128, 128], "activation_class": nn.ReLU}
     critic = modules.ValueOperator(modules.MLP(n + m, 1, **sizes), ["observation", "action"])
     actor: Any
+    bounds: Any = (low, high)
     if name == "TD3":
-        net = TensorDictModule(modules.MLP(n, m, **sizes), ["observation"], ["param"])
-        squashed = modules.TanhModule(["param"], ["action"], low=low, high=high)
+        net: Any = TensorDictModule(modules.MLP(n, m, **sizes), ["observation"], ["param"])
+        squashed: Any = modules.TanhModule(["param"], ["action"], low=low, high=high)
         actor = TensorDictSequential(net, squashed)
-        loss: Any = TD3Loss(actor, critic, bounds=(low, high))
-        noise = modules.AdditiveGaussianModule(env.action_spec, sigma_init=0.1, sigma_end=0.1)
+        loss: Any = TD3Loss(actor, critic, bounds=bounds)
+        noise: Any = modules.AdditiveGaussianModule(env.action_spec, sigma_init=0.1, sigma_end=0.1)
         explore: Any = TensorDictSequential(actor, noise)
     else:
         head = nn.Sequential(modules.MLP(n, 2 * m, **sizes), modules.NormalParamExtractor())
@@ -218,7 +220,9 @@ def agent(name: str, id: str, seed: int, count: int) -> Callable[[Tensor], Tenso
         for i in range(ENVS // 2 * (k * ENVS > RANDOM)):
             losses, late = loss(replay.sample()), {"loss_actor"} if name == "TD3" and i % 2 else ()
             optimizer.zero_grad()
-            sum(losses[x] for x in {*losses.keys()} - {*late} if x.startswith("loss_")).backward()
+            own = (losses[x] for x in {*losses.keys()} - {*late} if x.startswith("loss_"))
+            total: Any = sum(own)
+            total.backward()
             optimizer.step()
             target.step()
     collector.shutdown()
@@ -273,7 +277,8 @@ def from_log(rows: Rows) -> None:
     torch.manual_seed(rows.seed)
     log = collect_log(rows.cfg, rows.physics)
     start = candidates(rows.cfg, rows.physics, log)[NONLINEAR]
-    plant, transitions = start.plant(rows.physics), rows.cfg.start.transitions
+    plant: Any = start.plant(rows.physics)
+    transitions = rows.cfg.start.transitions
     mpc: Any = make_mpc(rows.cfg, plant, start)
     model, count = mpc.sequential, []
     hook = model.dynamics.register_forward_pre_hook(lambda _, x: count.append(x[0].shape[:-1]))

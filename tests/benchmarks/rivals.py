@@ -404,6 +404,7 @@ def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Any]:
 DESIGNS = ("mean", "Riccati", "moved", "two numbers", "improve", "improve, H", "Q-learning")
 #: What the designs by gradients learn, besides soft bounds.
 LEARNED = {"improve": ("q",), "improve, H": ("q", "H", "H_f")}
+IMPROVE: Any = {"updates": 60, "steps": STEPS}
 
 
 def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dict[str, Any]]:
@@ -428,7 +429,7 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
             policy = tuned(plant, found, models, known.std, seed).policy
         elif design in LEARNED:
             mpc = designed(plant, found, learn=LEARNED[design])
-            policy, options = mpc.policy, {"updates": 60, "steps": STEPS, "seed": seed}
+            policy, options = mpc.policy, IMPROVE | {"seed": seed}
             kept = qm.improve(mpc, found, cost=price, **options).kept
         elif design == "Q-learning":
             mpc, model = q_learning(name, size, seed)

@@ -168,7 +168,7 @@ def own_models() -> str:
         [x + APART * torch.randn(horizon, *x.shape, generator=noise).double() for x in (A, B)]
         for _ in range(MODELS)
     )
-    C = torch.stack([banded_matrix(*model, horizon) for model in models])
+    C = torch.stack([banded_matrix(x, u, horizon) for x, u in models])
     for own in (False, True):
         seconds = []
         for _ in range(ROUNDS + 1):

@@ -40,5 +40,5 @@ def test_the_pendulum_is_gymnasiums():
     for torque in np.random.default_rng(0).uniform(-2, 2, 50):
         y, reward, *_ = env.step(np.array([torque]))
         s, cost = pendulum(s, torque)
-        np.testing.assert_allclose(-reward, cost, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(-float(reward), cost, rtol=0, atol=1e-4)
     np.testing.assert_allclose(y, (np.cos(s[0]), np.sin(s[0]), s[1]), rtol=0, atol=1e-4)

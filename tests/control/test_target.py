@@ -134,7 +134,7 @@ def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target():
 def test_rounding_beside_outputs_of_large_numbers_sets_no_length():
     """An integrator and a lag, each with an output: the basis of the steady states is dense."""
     B, C = np.random.default_rng(0).normal(size=(2, 3)), np.diag([1e2, 1e6])
-    weights = {"Q": [1e-4, 1e-12], "dR": 1.0, "u_bounds": (-1.0, 2.0)}
-    bounds = {"y_bounds": {"y2": (-1e6, 1e6)}}
+    weights: Any = {"Q": [1e-4, 1e-12], "dR": 1.0, "u_bounds": (-1.0, 2.0)}
+    bounds: Any = {"y_bounds": {"y2": (-1e6, 1e6)}}
     mpc = qm.LinearMPC((np.diag([1.0, 0.6]), B, C), 4, **weights, **bounds)
     assert make_tables(mpc.targets).condition < 1e3

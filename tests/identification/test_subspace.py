@@ -130,8 +130,8 @@ def test_longer_steps_raise_the_likelihood_faster():
 
 def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken():
     """One of two states, of a plant with three: the likeliest is off by 0.4 far ahead."""
-    rng, x, A = np.random.default_rng(0), np.zeros(3), scipy.linalg.block_diag(np.eye(2), 0.6)
-    A[:2] = [[0.98, 0.1, 0], [-0.1, 0.95, 0.1]]
+    rng, x = np.random.default_rng(0), np.zeros(3)
+    A = np.array([[0.98, 0.1, 0], [-0.1, 0.95, 0.1], [0, 0, 0.6]])
     y, u = np.zeros((501, 1)), rng.uniform(-1, 1, (500, 1))
     for k in range(501):
         y[k] = x[0] + 1e-3 * rng.normal()

@@ -726,7 +726,7 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
     lower, upper = sides
     moves = name == "du_bounds"
     ordered = (lower <= 0) & (upper >= 0) if moves else lower <= upper
-    for i in np.flatnonzero(~ordered):
+    for i in np.flatnonzero(~ordered).tolist():
         got, want = f"({lower[i]:g}, {upper[i]:g}) for {names[i]}", "lower <= upper in each pair"
         raise QPError.expected(name, got, "zero between the bounds" if moves else want)
     return lower, upper

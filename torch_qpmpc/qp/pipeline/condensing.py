@@ -272,8 +272,8 @@ def eliminate(C: np.ndarray, n_kept: int, threshold: float = THRESHOLD) -> Elimi
     the actions of an unstable model are at their bounds and its states grow, only this recursion is
     accurate in every entry.
     """
-    *parts, regular = kernels.eliminate(C, n_kept, RANK_TOLERANCE, threshold)
-    return Elimination(*parts, None) if regular else null_space(C, n_kept)
+    T, *factors, regular = kernels.eliminate(C, n_kept, RANK_TOLERANCE, threshold)
+    return Elimination(T, *factors, padding=None) if regular else null_space(C, n_kept)
 
 
 def null_space(C: np.ndarray, n_kept: int) -> Elimination:

@@ -35,8 +35,8 @@ def diagnose(programs: Programs) -> np.ndarray:
     n_f, ranges, statuses = programs.n_f, {}, []
     for i, m in enumerate(programs.group.tolist()):
         H, C, G = (x[m % len(x)] for x in programs.theta[:3])
-        q, _, b, *rows = (x[i % len(x)] for x in programs.theta[3:])
-        qp = _FreeQP.of(H, q, C, b, G, *rows, programs.fixed[i])
+        q, _, b, lb, ub, w = (x[i % len(x)] for x in programs.theta[3:])
+        qp = _FreeQP.of(H, q, C, b, G, lb, ub, w, programs.fixed[i])
         ranges[m] = ranges.get(m) or _Range.of(C[:, n_f:])
         statuses.append(int(_status(qp, ranges[m])))
     return np.array(statuses, np.int64)

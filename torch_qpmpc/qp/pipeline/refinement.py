@@ -218,8 +218,8 @@ class _Solver(NamedTuple):
         H, A = K[:n, :n], K[n:, :n]
         if not np.isfinite(K).all():
             return cls(scale, H, np.full_like(A.T, np.nan), H, False)
-        parts = (torch.from_numpy(x)[None] for x in (H, A))
-        of_A, of_H, (rank,) = (x.numpy() for x in null_space_inverses(*parts, SINGULAR, FLAT))
+        one = torch.from_numpy(H)[None], torch.from_numpy(A)[None]
+        of_A, of_H, (rank,) = (x.numpy() for x in null_space_inverses(*one, SINGULAR, FLAT))
         return cls(scale, H, of_A[0], of_H[0], bool(rank < len(A)))
 
     def solve(self, right: np.ndarray) -> tuple[np.ndarray, float]:
