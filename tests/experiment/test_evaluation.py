@@ -22,7 +22,7 @@ def test_the_summary_has_each_J_the_gap_and_the_rivals():
     assert found.loops["learned"] is found.loops["start"]
     found.evaluate(lambda s: -s[:, :2] - s[:, 2:])
     start, learned, true = (found.loops[n].J for n in ("start", "learned", "true model"))
-    assert start == evaluate(cfg, mpc.policy, physics).J
+    assert start == pytest.approx(evaluate(cfg, mpc.policy, physics).J, rel=1e-9)
     summary = found.summary()
     expected = {"J_start": start, "J_best": learned, "J_final": learned, "J_true_model": true}
     expected["closed_gap"] = (start - learned) / (start - true)
