@@ -98,7 +98,7 @@ def smooth(par: Noisy, group: Group) -> Smoothed:
 def em(
     par: Noisy, data: Sequence[Signals], iterations: int, growth: float = 1.0, gain: float = 0.0
 ) -> Noisy:
-    """Raise the likelihood by expectation maximisation, if it gains as much as ``gain`` by a row.
+    """Raise the likelihood by expectation maximisation; ``par`` if a row gains less than ``gain``.
 
     With a ``growth`` above 1, steps are lengthened by a factor that grows so in each (Salakhutdinov
     and Roweis 2003); from one that lowers the likelihood it returns, and the factor is 1 again.

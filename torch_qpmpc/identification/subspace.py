@@ -33,9 +33,8 @@ from torch_qpmpc.identification.likelihood import (
 from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.identification.ridge import ridge
 
-#: Iterations of expectation maximisation, of a candidate and of the fit; and the further ones, of
-#: steps that grow by a factor, of a fit that predicts the last horizon as well with them, and gains
-#: so much likelihood by a row: less is often noise that is not constant, not a better model.
+#: Iterations of expectation maximisation, of a candidate and of the fit; further ones, their growth
+#: and the least gain of a row by them: less is often noise that varies, not a better model.
 FEW, SOME, MANY, GROWTH, GAIN = 5, 10, 200, 1.2, 0.1
 #: Directions of the states, of unit variance, that the outputs show less than this are kept as
 #: states of their own.
@@ -123,10 +122,11 @@ def fit_state_space(
     model = measured(data, filled)
     if order:
         par = em(_states(_predictor(filled, lags), order), data, SOME)
-        likely, held = em(par, data, MANY, GROWTH, GAIN), _Held(trajectories)
-        some, many = map(steady, (par, likely))
-        far = [_far(one, data, held) for one in (some, many)]
-        model = readable(many if far[1] <= far[0] else some, data)
+        likely, model = em(par, data, MANY, GROWTH, GAIN), steady(par)
+        if likely is not par:
+            held, many = _Held(trajectories), steady(likely)
+            model = many if _far(many, data, held) <= _far(model, data, held) else model
+        model = readable(model, data)
     return Fit(
         normal.restore(model), order or 0, lags, tuple(rows), tuple(map(normal.restore, parts))
     )

@@ -526,8 +526,8 @@ def improve(
 
     mpc.on_failure, curve, kept = "mask", [], False
     try:
-        old = tried()
         descent = Descent(mpc, plant, loops, steps, window, rate, seeds[1])
+        old = tried()
         schedule = LinearLR(descent.optimizer, 1.0, 1 / updates, updates)
         for _ in range(updates):
             curve.append(descent.update(penalty).item())

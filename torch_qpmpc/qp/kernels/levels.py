@@ -4,8 +4,8 @@ A *decision* is the level of one action in one stage; its row of G is held betwe
 the highest level that are left to it. A node of the tree is a QP that
 `torch_qpmpc.qp.kernels.active_set` solves. Multipliers stay feasible whatever the levels, so each
 node starts from the last one's, and the dual cost ends a node as soon as it exceeds the best
-plan's. The search goes deep first, into the nearer levels: it soon
-has a plan, and its memory is one branch.
+plan's. The search goes deep first, into the nearer levels: it soon has a plan, and its memory is
+one branch.
 
 Minimum times and start costs are no rows: an automaton of each action, on or off (its lowest
 level) for so many steps, leaves each decision only levels that some sequence allows, and adds the

@@ -31,18 +31,18 @@ SETTINGS = {"primal_tol": 1e-9, "dual_tol": 1e-12, "iter_limit": 2000}
 
 def solve(qps: SoftQPs) -> BackendSolution:
     """Solve a batch; in a large one, start each QP from the active set of a similar one."""
-    kinds, H = _alike(qps), qps.H
+    kinds, inverse = _alike(qps), None
     if len(kinds) == 1:
         return _solve_alike(qps)
     solution = BackendSolution(np.zeros_like(qps.g), np.zeros_like(qps.l), np.zeros_like(qps.group))
-    inverse, shift = inverse_factors(H)
-    if own := len(H) > 1 and not shift.any():  # with H = I, a setup takes a fraction of the time
-        G, inverse = qps.G @ inverse.swapaxes(1, 2), inverse[qps.group]
+    if len(qps.H) > 1 and not (factors := inverse_factors(qps.H))[1].any():
+        G, inverse = qps.G @ factors[0].swapaxes(1, 2), factors[0][qps.group]
         g = np.einsum("bij,bj->bi", inverse, qps.g)
-        qps = qps._replace(H=np.eye(H.shape[1])[None], G=G, g=g)
+        qps = qps._replace(H=np.eye(G.shape[2])[None], G=G, g=g)  # whose setup is fast
     for index in kinds:
         solution.put(index, _solve_alike(qps.take(index)))
-    return solution._replace(v=np.einsum("bij,bi->bj", inverse, solution.v)) if own else solution
+    v = solution.v if inverse is None else np.einsum("bij,bi->bj", inverse, solution.v)
+    return solution._replace(v=v)
 
 
 def _alike(qps: SoftQPs) -> list[np.ndarray]:
