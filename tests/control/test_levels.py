@@ -65,6 +65,7 @@ def test_zones_need_no_weight_of_outputs(seed, levels):
     for _ in range(3):
         controller.step(0.7 * rng.normal(size=n))
         assert controller.status.name == "SOLVED"
+    assert not any("terminal" in str(fault) for fault in controller.review().faults)
 
 
 def test_minimum_times_count_what_was_applied_with_missing_outputs_and_manual_mode():

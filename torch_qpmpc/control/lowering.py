@@ -143,9 +143,8 @@ def riccati(design: Design) -> Array | None:
     plant, m = design.plant, design.plant.sizes[1]
     if _costless(design):
         return None
-    A, B = plant.A, plant.B
+    A, B, S = plant.A, plant.B, np.zeros_like(plant.B)
     Q, R = 2 * plant.C.T @ design.Q @ plant.C, 2 * (design.R + design.dR)
-    S = np.zeros_like(B)
     if design.moves:
         A, B = block_diag(A, np.zeros((m, m))), np.vstack((B, np.eye(m)))
         Q, S = block_diag(Q, 2 * design.dR), np.vstack((S, -2 * design.dR))
@@ -157,9 +156,10 @@ def riccati(design: Design) -> Array | None:
         return None
     radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
     eigenvalues = torch.linalg.eigvalsh(P)
-    exists = radius < 1 - 1e-9 and eigenvalues[0] >= -1e-9 * eigenvalues[-1].abs()
+    rounding = TINY * W.diagonal().max()
+    exists = radius < 1 - 1e-9 and eigenvalues[0] >= -max(1e-9 * eigenvalues[-1].abs(), rounding)
     P, sizes = P.numpy(), np.concatenate((of_x, of_u))[: len(P)]
-    costless = np.diag(P) <= TINY**1.5 * np.diag(P).max()
+    costless = np.diag(P) <= rounding.item()
     P[costless] = P[:, costless] = 0.0  # rounding would set the lengths of the QP
     return P / np.outer(sizes, sizes) if exists else None
 
