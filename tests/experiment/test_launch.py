@@ -98,7 +98,7 @@ def test_sigterm_stops_a_run_whatever_a_library_makes_of_it(tmp_path, monkeypatc
     monkeypatch.setattr("train.train", raised)
     with pytest.raises(SystemExit) as ended:
         run_command(*SMALL, f"hydra.run.dir={tmp_path}")
-    assert ended.value.code == 128 + signal.SIGINT
+    assert ended.value.code == 128 + signal.SIGTERM
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 

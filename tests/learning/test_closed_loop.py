@@ -287,6 +287,7 @@ NOTHING = qm.QPMPC.from_model(PointMass().A, PointMass().B, 3, stage_weight=[1.0
     ({"plant": ManyModels(), "held_out": 16}, "held_out: got 16, .* whole number >= 18"),
     ({"rate": 0.0}, "rate: got 0.0"),
     ({"seed": -1}, "seed: got -1"),
+    ({"cost": lambda p, u: p[:, 0]}, "cost: got a function, expected None: the plant has a cost"),
 )
 def test_improve_refuses(change):
     plant = PointMass()

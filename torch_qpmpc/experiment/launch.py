@@ -109,7 +109,7 @@ def launched() -> Iterator[tuple[str, bool]]:
         if sweep or not (stopped or isinstance(error, KeyboardInterrupt)):
             raise
         print(f"\nStopped: go on with {same_command(folder)}", flush=True)
-        raise SystemExit(128 + signal.SIGINT) from None
+        raise SystemExit(128 + (stopped or [signal.SIGINT])[-1]) from None
     finally:
         logging.captureWarnings(False)
         for signum, handler in usual.items():

@@ -167,7 +167,7 @@ class _Course:
     """
 
     def __init__(self, models: Sequence[Innovations]) -> None:
-        names = ("A", "B", "E", "offset", "C", "x0")
+        names = "A", "B", "E", "offset", "C", "x0"
         parts = ([getattr(x, name) for x in models] for name in names)
         self.A, self.B, self.E, self.offset, self.C, self.x0 = map(_stacked, parts)
         runs = [model.settling(STEPS) for model in models]
@@ -195,9 +195,8 @@ class _Course:
 
 def _stacked(parts: Sequence[np.ndarray]) -> Tensor:
     """Stack arrays, the smaller ones with zeros at their ends."""
-    shape = np.max([x.shape for x in parts], 0)
-    padded = [np.pad(x, [(0, n) for n in shape - x.shape]) for x in parts]
-    return torch.as_tensor(np.array(padded))
+    sizes = np.max([x.shape for x in parts], 0)
+    return torch.as_tensor(np.array([np.pad(x, [(0, n) for n in sizes - x.shape]) for x in parts]))
 
 
 def _root(V: np.ndarray) -> np.ndarray:
@@ -512,6 +511,8 @@ def improve(
     check_seed(seed)
     if isinstance(plant, Identified):
         plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), mpc.horizon, members, seed)
+    elif cost is not None:
+        raise QPError.expected("cost", "a function", "None: the plant has a cost of its own")
     if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
         got = f"{type(plant).__name__}, without {', '.join(missing)}"
         raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")
