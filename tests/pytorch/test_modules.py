@@ -123,6 +123,18 @@ def test_solutions_of_inference_mode_are_differentiable_afterwards(solver):
     assert_close(outcome(mpc, S, A), outcome(twin, S, A))
 
 
+def test_a_module_of_inference_mode_acts_by_its_own_theta():
+    s, start = 0.1 * S, random_mpc(0).policy(0.1 * S).detach()
+    with torch.inference_mode():
+        mpc = random_mpc(0)
+        assert_close(mpc.policy(s[0]), start[0])
+        mpc.q.data += 0.5
+        expected = mpc.policy(s)[0]
+        assert not torch.allclose(expected, start[0])
+        for action in (mpc.policy(s[0]), torch.as_tensor(mpc.predict(s[0]))):
+            assert_close(action, expected)
+
+
 def test_no_gradient_is_recorded_where_none_is_needed():
     mpc = random_mpc(0)
     with torch.no_grad():

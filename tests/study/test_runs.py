@@ -3,6 +3,7 @@ import math
 import shutil
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.analysis.structure import NearestModel, canonical
 from torch_qpmpc.envs import LinearSystem
 from torch_qpmpc.experiment.algorithms import evaluate
+from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.study.runs import FinishedRun, collect, prediction_error
 
 
@@ -117,6 +119,51 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
     assert run.cfg.task.name == "point_mass"
     with pytest.raises(QPError, match=r"^folder: got .*, without config.yaml, expected the folder"):
         qm.load_run(tmp_path)
+
+
+@pytest.fixture
+def acting(tmp_path):
+    """Make a run whose policy, with soft bounds, acts on an observer's estimate."""
+    A, one, zero = np.array([[0.9, 0.5], [0.0, 0.8]]), np.eye(2), np.zeros(2)
+    B, C = np.array([[0.0], [0.5]]), np.array([[1.0, 0.0]])
+    L, none = np.array([[0.5], [0.2]]), np.zeros((2, 0))
+    run: Any = FinishedRun(tmp_path)
+    run.observer = Innovations(A, B, none, zero, C, L, one[:1, :1], zero, 0 * one)
+    bounds = {"action_bounds": ([-1.0], [0.5]), "action_slack": 0.1}
+    run.policy = qm.QPMPC.from_model(A, B, 5, stage_weight=[1.0, 1.0, 0.01], **bounds)
+    return run
+
+
+def test_a_run_s_action_is_within_soft_bounds_and_its_observer_knows_it(acting):
+    kalman = qm.envs.KalmanFilter(acting.observer)
+    x, excess = torch.zeros(2), torch.tensor(0.0)
+    for k, y in enumerate(torch.tensor([[40.0], [-60.0], [20.0]])):
+        x = kalman.following(x, u, x[:0], y, k) if k else kalman.first(y)  # noqa: F821
+        wanted = acting.policy.policy(x).detach()
+        u = wanted.clamp(-1.0, 0.5)
+        excess += (u - wanted).abs().sum()
+        assert acting.predict(y) == pytest.approx(u.numpy(), abs=1e-9)
+    assert excess > 0.1, "soft bounds were exceeded"
+    acting.observer = None
+    action = acting.predict(np.array([9.0, 0.0], np.float32))
+    assert (action, action.dtype) == (-1.0, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (np.ones((3, 1)), r"got shape \(3, 1\), expected shape \(1,\). Pass begins=True"),
+        (np.ones(2), r"got shape \(2,\), expected shape \(\*batch, 1\)"),
+        ({"y": 1.0}, r"got \{'y': 1\.0\}, expected a tensor, or"),
+    ],
+)
+def test_an_observation_that_does_not_continue_the_episode_is_an_error(
+    acting, observation, message
+):
+    acting.predict([1.0])
+    with pytest.raises(QPError, match=f"^observation: {message}"):
+        acting.predict(observation)
+    assert acting.predict(np.ones((3, 1)), begins=True).shape == (3, 1)
 
 
 @pytest.mark.parametrize(

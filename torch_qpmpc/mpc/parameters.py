@@ -164,13 +164,13 @@ class Leaves:
         self._walked = _walked(module)
         tensors = [x for x in self._walked if isinstance(x, Tensor)]
         attributes = (vars(x).values() for x in self._walked if isinstance(x, nn.Module))
-        plain = all(
-            type(x) in PLAIN and x.device.type == "cpu" and x.is_contiguous() for x in tensors
-        )
+        plain = all(type(x) in PLAIN and x.is_cpu and x.is_contiguous() for x in tensors)
+        plain = plain and not any(x.is_inference() for x in tensors)  # which have no version
         self.known = plain and not any(isinstance(x, Tensor) for part in attributes for x in part)
         rest = [x for name, x in module._buffers.items() if name not in module.learned]
         large = {id(x) for x in rest if x.numel() > LARGE}
-        self._states, self._contents = [(x, x.data_ptr(), x._version) for x in tensors], []
+        states = ((x, x.data_ptr(), x._version) for x in tensors if self.known)
+        self._states, self._contents = [*states], []
         for x in tensors if self.known else ():
             if id(x) not in large:
                 words = np.uint8 if x.nbytes % 8 else np.uint64

@@ -61,8 +61,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
                 f"{errors} ({nearer} of {len(runs)})",
             ]
         )
-    head = ["case, noise", "closed gap", "J", "distance", "zeros", "prediction error"]
-    return table(head, lines)
+    return table(["case, noise", "closed gap", "J", "distance", "zeros", "prediction error"], lines)
 
 
 def overall(sweep: pd.DataFrame) -> str:
@@ -90,8 +89,7 @@ def figures(sweep: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
         return
     for noise, runs in sweep.groupby("noise"):
         yield f"learning-{noise}", plots.learning_figure(runs)
-        learned = runs.query("constraint != 'fixed'")
-        if len(learned):
+        if len(learned := runs.query("constraint != 'fixed'")):
             yield f"constraints-{noise}", plots.constraints_figure(learned)
     if any(sweep["prediction_error"].notna()):  # the true model is known
         yield "meaning", plots.meaning_figure(sweep)

@@ -43,9 +43,11 @@ from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.layout import band_distance
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import read_numbers
 
 #: The paper's cases, in its order.
 CASES = ("fixed", "free", "deviation", "si", "combined")
+NEW = "Pass begins=True to begin other episodes."
 #: Smallest J_start - J_true_model for which the closed gap is meaningful, as a share of J_start.
 REAL_GAP = 0.5
 #: Settings that labels leave out: they vary within a case, or do not affect learning.
@@ -70,7 +72,7 @@ class FinishedRun:
 
     @torch.no_grad()
     def predict(self, observation: Any, begins: bool = False) -> np.ndarray:
-        """Return the learned policy's action ``(*batch, n_u)`` for the next observation.
+        """Return the policy's action ``(*batch, n_u)``, within its bounds, for an observation.
 
         A run that started from a log acts on its `observer`'s estimate, and remembers the steps.
 
@@ -81,21 +83,22 @@ class FinishedRun:
         Raises:
             QPError: the observation has another shape.
         """
-        if self.observer is None:
-            return self.policy.predict(observation)
-        split, model, k = self.policy.n_p - self.policy.n_x, self.observer, 0
-        p = torch.as_tensor(np.asarray(observation, float))
-        d, y = check_tensor("observation", p, split + len(model.C)).tensor_split([split], -1)
+        own, model, k = self.policy, self.observer, 0
+        low, high = map(np.asarray, own.scheme.bounds.action_bounds or (-np.inf, np.inf))
+        if model is None:
+            return np.clip(u := own.predict(observation), low, high, dtype=u.dtype)
+        n_d, p = own.n_p - own.n_x, read_numbers("observation", observation)
+        d, y = check_tensor("observation", p, n_d + len(model.C)).tensor_split([n_d], -1)
         if begins or not self._last:
             x = (kalman := KalmanFilter(model)).first(y)
-            own = self.policy
             act = own.predict if own.sequential is None else warm_policy(own)
         else:
             kalman, act, x, u, known, k = self._last
+            check_tensor("observation", p, *x.shape[:-1], p.shape[-1], batched=False, remedy=NEW)
             x = kalman.following(x, u, known, y, k)
-        u = torch.as_tensor(act(torch.cat((d, x), -1)))
-        self._last = kalman, act, x, u, d[..., : model.E.shape[-1]], k + 1
-        return u.numpy()
+        u = np.asarray(act(torch.cat((d, x), -1))).clip(low, high)
+        self._last = kalman, act, x, torch.as_tensor(u), d[..., : model.E.shape[-1]], k + 1
+        return u
 
     @cached_property
     def cfg(self) -> Config:
@@ -211,9 +214,8 @@ def collect(folder: str | Path) -> pd.DataFrame:
 
 def _labels(sweep: pd.DataFrame) -> list[str]:
     """Name each run by its case, and by its ablation or the settings that vary within its case."""
-    text = {float: "{:g}".format}
     settings = [run.cfg.settings.items() for run in sweep["run"]]
-    flat = [{key: text.get(type(x), str)(x) for key, x in own} for own in settings]
+    flat = [{k: f"{x:g}" if type(x) is float else str(x) for k, x in own} for own in settings]
     keys = pd.DataFrame(flat, index=sweep.index)
     keys = keys[[x for x in keys if x not in _UNLABELLED and not x.startswith("noise.")]]
     varied = keys.groupby(sweep["constraint"]).nunique() > 1
