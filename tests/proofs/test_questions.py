@@ -73,6 +73,40 @@ def test_invariance_is_proved_of_one_polytope_and_refuted_of_another():
     assert (BOX.A @ outside.states[1] - BOX.b).max() == pytest.approx(outside.value)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_a_proof_does_not_depend_on_units(unit):
+    """A loop that violates its bounds by 10 % of them is refuted in any unit of the state."""
+    mpc = QPMPC.from_model(
+        A,
+        unit * B,
+        3,
+        stage_weight=[1 / unit**2, 1 / unit**2, 0.1],
+        state_bounds=(unit * BOX.lower, unit * BOX.upper),
+        state_slack=100.0 / unit,
+        action_bounds=([-1.0], [1.0]),
+    )
+    at = Polytope.box(unit * BOX.lower, unit * BOX.upper)
+    plant = Plant.of(A, unit * B, disturbances=Polytope.box(unit * NOISE.lower, unit * NOISE.upper))
+    answer = largest_violation(mpc, plant, at, lower=at.lower, upper=at.upper)
+    assert answer.value / unit == pytest.approx(0.1, abs=1e-6)
+    assert answer.bound / unit == pytest.approx(0.1, abs=1e-6)
+    assert answer.refuted
+    assert not answer.proved
+    # The start at zero velocity has no size there, but the bound has.
+    rest = Polytope.box([-unit, 0.0], [unit, 0.0])
+    assert not largest_violation(mpc, plant, rest, upper=[np.inf, 0.02 * unit]).proved
+
+
+@pytest.mark.parametrize("bounds", [([-np.inf], [1.0]), ([-1.0], [np.inf]), ([-1e10], [1.0])])
+def test_hard_bounds_of_one_side_leave_slack(bounds):
+    """From x = (1, 0.5), u = -1 leaves 1.08; without a lower bound of u it leaves less."""
+    mpc = scheme(state_bounds=None, action_bounds=bounds)
+    answer = largest_violation(mpc, Plant.of(A, B), BOX, **BOUNDS)
+    x = np.array(answer.states[0])
+    u = mpc.policy(torch.tensor(x)).detach().numpy()
+    assert (np.abs(A @ x + B @ u) - BOX.upper).max() == pytest.approx(answer.bound, abs=1e-5)
+
+
 def test_the_worst_of_several_plants_counts():
     """From x = (1, 0.5), u = -1 leaves 1.09 with half of B, and 1.08 with B."""
     half, whole, near = Plant.of(A, 0.5 * B), Plant.of(A, B), Polytope.box([0.8, 0.3], BOX.upper)

@@ -14,7 +14,7 @@ network controllers using mixed-integer programming", IEEE TAC, for multi-parame
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,7 +24,6 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.tables import Tables
 from torch_qpmpc.proofs.program import Affine, Array, Program
 from torch_qpmpc.qp.program import QuadraticProgram, Status
-from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve_qp
 
 #: Fraction of the largest possible slack that the plan with slack has in its hard rows.
@@ -55,6 +54,10 @@ def encode(program: Program, tables: Tables, p: Affine, vertices: Array) -> Affi
     Raises:
         QPError: the QP is infeasible at a vertex, or its hard rows leave no interior there.
     """
+    # HiGHS' tolerances are absolute, so y and lam are in units of the largest y.
+    size = np.abs(vertices @ tables.rows.Y.T).max(initial=0.0) or 1.0
+    units = {name: getattr(tables.rows, name) / size for name in ("Y", "lower", "upper", "w")}
+    tables = replace(tables, rows=replace(tables.rows, **units), F=size * tables.F)
     reach = _derived(tables, vertices)
     for _ in range(ROUNDS):
         _tighten(program, tables, p, reach)
@@ -68,17 +71,32 @@ def _derived(tables: Tables, vertices: Array) -> Reach:
     _check_known(tables, vertices)
     hard = np.isinf(rows.w)
     lower, upper = rows.lower - y_free, rows.upper - y_free
-    slack = np.zeros(len(vertices))
-    if hard.any():
-        slack = SHARE * _slack(tables.R[hard], lower[:, hard], upper[:, hard], vertices)
-    slack_of = hard * slack[:, None]
-    solution = _solve_rows(tables.R, lower + slack_of, upper - slack_of, rows.w)
-    assert (solution.status == Status.SOLVED).all(), "the plan with slack solves these QPs"
-    cost = solution.value.numpy().max(initial=0.0)
-    radius = np.sqrt(2 * cost) * (1 + MARGIN)
-    most = np.where(hard, cost * (1 + MARGIN) / slack.min() if hard.any() else np.inf, rows.w)
-    forces = (np.where(np.isfinite(x), most, 0.0) for x in (rows.upper, rows.lower))
-    return Reach(y_free.min(0) - radius, y_free.max(0) + radius, *forces)
+    radius = np.sqrt(2 * _least_cost(tables.R, lower, upper, rows.w, vertices)) * (1 + MARGIN)
+    low, high = y_free.min(0) - radius, y_free.max(0) + radius
+    # Rows out of reach never act.
+    lower = np.where(low < rows.lower, lower, -np.inf)
+    upper = np.where(high > rows.upper, upper, np.inf)
+    acts, most = hard & (np.isfinite(lower) | np.isfinite(upper)).any(0), rows.w
+    if acts.any():
+        slack = _slack(tables.R[acts], lower[:, acts], upper[:, acts], vertices)
+        slack_of = acts * SHARE * slack[:, None]
+        cost = _least_cost(tables.R, lower + slack_of, upper - slack_of, rows.w, vertices)
+        most = np.where(hard, cost * (1 + MARGIN) / (SHARE * slack.min()), rows.w)
+    forces = (np.where(np.isfinite(x).any(0), most, 0.0) for x in (upper, lower))
+    return Reach(low, high, *forces)
+
+
+def _least_cost(R: Array, lower: Array, upper: Array, w: Array, vertices: Array) -> float:
+    """Return the largest ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])``."""
+    n, zeros = R.shape[1], torch.zeros(1, dtype=torch.float64)
+    rows = [torch.as_tensor(x) for x in (R, lower, upper, w)]
+    # H, q, c, C and b: C has no rows.
+    cost = (torch.eye(n).double(), zeros.expand(n), zeros[0], zeros.expand(0, n), zeros[:0])
+    qp = QuadraticProgram(*cost, *rows)  # pyright: ignore[reportArgumentType] - nine tensors
+    solution = solve_qp(qp, solver="daqp", on_failure="mask")
+    for p in vertices[(solution.status != Status.SOLVED).numpy()]:
+        _raise_infeasible(p)
+    return solution.value.numpy().max(initial=0.0)
 
 
 def _check_known(tables: Tables, vertices: Array) -> None:
@@ -100,28 +118,18 @@ def _raise_infeasible(p: Array) -> None:
 
 
 def _slack(R: Array, lower: Array, upper: Array, vertices: Array) -> Array:
-    """Return the largest slack that all hard rows can have at each vertex, ``(count,)``."""
+    """Return the largest slack, up to 1, that all rows can have at each vertex, ``(count,)``."""
     slack, n = np.zeros(len(vertices)), R.shape[1]
     matrix = np.column_stack((np.concatenate((R, -R)), np.ones(2 * len(R))))
     for i, p in enumerate(vertices):
         right = np.concatenate((upper[i], -lower[i]))
         kept = np.isfinite(right)
-        bounds = [(None, None)] * n + [(0, None)]
+        bounds = [(None, None)] * n + [(0, 1)]
         result = linprog([0] * n + [-1], matrix[kept], right[kept], bounds=bounds, method="highs")
         if result.status != 0 or result.x[-1] <= 0:
             _raise_infeasible(p)
         slack[i] = result.x[-1]
     return slack
-
-
-def _solve_rows(R: Array, lower: Array, upper: Array, w: Array) -> QPSolution:
-    """Solve ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])`` for many bounds."""
-    n, zeros = R.shape[1], torch.zeros(1, dtype=torch.float64)
-    rows = [torch.as_tensor(x) for x in (R, lower, upper, w)]
-    # H, q, c, C and b: C has no rows.
-    cost = (torch.eye(n).double(), zeros.expand(n), zeros[0], zeros.expand(0, n), zeros[:0])
-    qp = QuadraticProgram(*cost, *rows)  # pyright: ignore[reportArgumentType] - nine tensors
-    return solve_qp(qp, solver="daqp", on_failure="mask")
 
 
 def _tighten(program: Program, tables: Tables, p: Affine, reach: Reach) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, support
+from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, positive, support
 from torch_qpmpc.proofs.program import Array
 from torch_qpmpc.proofs.questions import TOLERANCE, Answer, action, check_states, invariance
 
@@ -98,7 +98,7 @@ def invariant_set(
         if _radius(laws) >= 1:
             continue
         A, b = _bounds(tables, states, u, gain)
-        candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre)
+        candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre, positive(states.size))
         if candidate and (proof := _proof(mpc, plants, candidate, seconds)) and proof.proved:
             return InvariantSet(candidate, scale, gain, proof)
     got = "a set without a part that is proved invariant"
@@ -130,16 +130,16 @@ def _equilibrium(law: Plant) -> Array:
 
 
 def _bounds(tables: Tables, states: Polytope, u: Array, gain: float) -> tuple[Array, Array]:
-    """Return rows of length 1: the states, and the bounds of ``u + gain (K p + k - u)``."""
+    """Return rows of the states, and of the bounds of ``u + gain (K p + k - u)``, of length 1."""
     K, k = gain * tables.K, u + gain * (tables.k - u)
     A = np.concatenate((states.A, K, -K))
     b = np.concatenate((states.b, tables.u_upper - k, k - tables.u_lower))
-    length = np.linalg.norm(A, axis=1)
+    length = np.linalg.norm(A * positive(states.size), axis=1)
     kept = np.isfinite(b) & (length > 0)
     return A[kept] / length[kept, None], b[kept] / length[kept]
 
 
-def _largest(laws: list[Plant], A: Array, b: Array) -> Polytope | None:
+def _largest(laws: list[Plant], A: Array, b: Array, unit: Array) -> Polytope | None:
     """Return the largest set in A p <= b that no law leaves; None without one of few rows."""
     i = 0
     while i < len(b):
@@ -150,7 +150,7 @@ def _largest(laws: list[Plant], A: Array, b: Array) -> Polytope | None:
             if reached == -np.inf or not np.isfinite(right) or len(b) > MOST_ROWS:
                 return None
             if not reached <= right:  # undecided ones are kept
-                length = float(np.linalg.norm(row)) or 1.0
+                length = float(np.linalg.norm(row * unit)) or 1.0
                 A, b = np.vstack((A, row / length)), np.append(b, right / length)
         i += 1
     kept = np.ones(len(b), bool)

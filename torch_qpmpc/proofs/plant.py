@@ -24,6 +24,11 @@ def _array(name: str, value: Any) -> Array:
     return read_numbers(name, value).detach().numpy().copy()
 
 
+def positive(x: Array, otherwise: Any = 1.0) -> Array:
+    """Return the entries of x, and ``otherwise`` where they are zero."""
+    return np.where(x > 0, x, otherwise)
+
+
 def support(A: Array, b: Array, row: Array) -> float:
     """Return the support function, max row'x with A x <= b; -inf if empty, nan if undecided."""
     result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
@@ -77,6 +82,11 @@ class Polytope:
         eye = np.eye(len(lower))
         return cls(np.concatenate((eye, -eye)), np.concatenate((upper, -lower)), lower, upper)
 
+    @property
+    def size(self) -> Array:
+        """The largest absolute value of each entry, ``(n,)``."""
+        return np.maximum(np.abs(self.lower), np.abs(self.upper))
+
     def is_box(self) -> bool:
         """Return True if the set is its bounding box."""
         return bool(((self.A != 0).sum(1) <= 1).all())
@@ -89,8 +99,7 @@ class Polytope:
         """
         n, ends = len(self.lower), [sorted({*x}) for x in zip(self.lower, self.upper, strict=True)]
         if (varying := sum(len(x) - 1 for x in ends)) > MOST_DIMENSIONS:
-            got, want = f"{varying} dimensions", f"at most {MOST_DIMENSIONS}"
-            raise QPError.expected("the set", got, want)
+            raise QPError.expected("the set", f"{varying} dimensions", f"at most {MOST_DIMENSIONS}")
         if self.is_box():
             return np.array(list(itertools.product(*ends)))
         with_radius = np.column_stack((self.A, np.linalg.norm(self.A, axis=1)))

@@ -106,10 +106,11 @@ class Program:
         """
         cost, relaxed = np.zeros(len(self.lower)), relaxed or not self.binaries
         np.add.at(cost, objective.columns, -objective.matrix[0])
+        size = np.abs(cost).max(initial=0.0) or 1.0  # HiGHS' tolerances are absolute
         options = {"mip_rel_gap": 0.0} | ({"time_limit": seconds} if np.isfinite(seconds) else {})
         for presolve in (True, False):  # by presolve's round-off HiGHS can miss an optimum
             result = milp(
-                cost,
+                cost / size,
                 integrality=np.zeros(len(cost)) if relaxed else self.binary,
                 bounds=(self.lower, self.upper),
                 constraints=self._constraints(),
@@ -121,9 +122,9 @@ class Program:
         if bound is None or result.status not in (0, 1):
             raise SolverError(f"HiGHS gave no bound of the worst case: {result.message}")
         constant = float(objective.constant[0])
-        value = -np.inf if result.fun is None else constant - result.fun
+        value = -np.inf if result.fun is None else constant - size * result.fun
         x = result.x if result.x is not None else np.full(len(cost), np.nan)
-        return Maximum(value, constant - bound, x, int(result.get("mip_node_count") or 0))
+        return Maximum(value, constant - size * bound, x, int(result.get("mip_node_count") or 0))
 
     def _constraints(self) -> tuple[csr_array, Array, Array]:
         if self._built is None:

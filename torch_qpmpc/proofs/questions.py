@@ -16,10 +16,10 @@ from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.validation import check_no_levels
 from torch_qpmpc.proofs.encoding import encode
-from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants
+from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, positive
 from torch_qpmpc.proofs.program import Affine, Array, Program
 
-#: A worst case up to this counts as zero: HiGHS' feasibility tolerance is 1e-6.
+#: A worst case up to this, relative to the set, counts as zero: HiGHS' tolerance is 1e-6.
 TOLERANCE = 1e-5
 #: A replayed worst case differs from the program's by at most this, relatively.
 AGREEMENT = 1e-4
@@ -27,39 +27,33 @@ AGREEMENT = 1e-4
 MOST_MODELS = 64
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Answer:
     """The worst case on a set.
 
     Attributes:
         question: the function that is maximised.
+        proved: it is nowhere positive on the set, but for 1e-5 of the set's size.
+        refuted: it exceeds that at some state.
         value: its largest value that a point of the set is known to have, by `QPMPC.policy`.
         bound: no point of the set has a larger one, but for HiGHS' tolerances.
         states: the worst states p_0, .., p_k, ``(k + 1, n_p)``.
         disturbances: the worst d of each step, ``(n_d,)``.
-        seconds, nodes, binaries: the effort, and the size of the largest program.
+        seconds, nodes, binaries: HiGHS' effort, and the size of the largest program.
         digest: SHA-256 of the QP that it is about, as in its tables.
     """
 
     question: str
-    value: float
-    bound: float
-    states: Array
-    disturbances: tuple[Array, ...]
-    seconds: float
-    nodes: int
-    binaries: int
     digest: str
-
-    @property
-    def proved(self) -> bool:
-        """True if the function is nowhere positive on the set."""
-        return self.bound <= TOLERANCE
-
-    @property
-    def refuted(self) -> bool:
-        """True if the function is positive at ``states``."""
-        return self.value > TOLERANCE
+    states: Array
+    disturbances: tuple[Array, ...] = ()
+    proved: bool = True
+    refuted: bool = False
+    value: float = -np.inf
+    bound: float = -np.inf
+    seconds: float = 0.0
+    nodes: int = 0
+    binaries: int = 0
 
     def __str__(self) -> str:
         outcome = f"undecided, between {self.value:.4g} and {self.bound:.4g}"
@@ -109,19 +103,14 @@ def largest_violation(
         True
     """
     n = check_states(mpc, states)
-    rows, right = [], []
-    for sign, bound in ((-1.0, lower), (1.0, upper)):
-        bound = np.full(n, np.inf) if bound is None else sign * np.array(bound, float)
-        if bound.shape != (n,) or np.isnan(bound).any():
-            raise QPError.expected("lower and upper", f"{bound}", f"({n},) numbers")
-        kept = np.isfinite(bound)
-        rows.append(sign * np.eye(n)[kept])
-        right.append(bound[kept])
-    A, b = np.concatenate(rows), np.concatenate(right)
-    if not len(b):
+    sides = [np.full(n, np.inf) if x is None else np.array(x, float) for x in (lower, upper)]
+    if any(x.shape != (n,) or np.isnan(x).any() for x in sides):
+        raise QPError.expected("lower and upper", f"{lower} and {upper}", f"({n},) numbers each")
+    A, b = np.concatenate((-np.eye(n), np.eye(n))), np.concatenate((-sides[0], sides[1]))
+    if not (kept := np.isfinite(b)).any():
         raise QPError.expected("lower and upper", "no finite bound", "at least one")
     question = f"largest violation in {steps} step{'s' * (steps > 1)}"
-    return _worst(question, mpc, plant, states, A, b, steps, seconds)
+    return _worst(question, mpc, plant, states, A[kept], b[kept], steps, seconds)
 
 
 def invariance(
@@ -153,23 +142,23 @@ def largest_difference(
         QPError: the QPs know or do different things, or as in `largest_violation`.
         SolverError: HiGHS gives no bound in time.
     """
-    n = check_states(first, states)
-    check_states(second, states)
+    n = max(check_states(one, states) for one in (first, second))
     if first.n_u != second.n_u:
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
-    program, tables = Program(), make_tables(first)
+    program, tables = Program(), [make_tables(x) for x in (first, second)]
     p, vertices = _known(program, states), states.vertices()
-    u, other = (encode(program, x, p, vertices) for x in (tables, make_tables(second)))
-    difference = u + other.times(-np.eye(first.n_u))
+    u, other = (encode(program, x, p, vertices) for x in tables)
     signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
+    rows = u.times(signs) + other.times(-signs)
 
     def replay(x: Array) -> tuple[Array, Array, tuple[Array, ...]]:
         at = p.at(x)
         return signs @ (action(first, at) - action(second, at)), at[None], ()
 
-    worst = _Worst("largest difference of the policies", tables.digest, np.full((1, n), np.nan))
-    worst.maximise(program, difference.times(signs), replay, seconds)
-    return worst.answer()
+    answer = Answer("largest difference of the policies", tables[0].digest, np.full((1, n), np.nan))
+    sizes = np.tile(np.max([_size_of_action(x, states) for x in tables], axis=0), 2)
+    _maximise(answer, program, rows, sizes, replay, seconds)
+    return answer
 
 
 def check_states(mpc: QPMPC, states: Polytope) -> int:
@@ -185,10 +174,17 @@ def check_states(mpc: QPMPC, states: Polytope) -> int:
 
 def _known(program: Program, states: Polytope) -> Affine:
     """Add p in the set of states."""
-    p = program.add(states.lower, states.upper)
+    unit = positive(states.size)
+    size = positive(np.abs(states.A) @ unit)
+    p = program.add(states.lower / unit, states.upper / unit).times(np.diag(unit))
     if not states.is_box():
-        program.constrain(p.times(states.A), upper=states.b)
+        program.constrain(p.times(states.A / size[:, None]), upper=states.b / size)
     return p
+
+
+def _size_of_action(tables: Tables, states: Polytope) -> Array:
+    free = np.abs(tables.K) @ states.size + np.abs(tables.k)
+    return positive(np.minimum(free, np.maximum(np.abs(tables.u_lower), np.abs(tables.u_upper))))
 
 
 def action(mpc: QPMPC, p: Array) -> Array:
@@ -214,16 +210,20 @@ def _worst(
         raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
     tables, program = make_tables(mpc), Program()
     start = _known(program, states)
-    worst = _Worst(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
+    answer = Answer(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
+    sizes = positive(np.abs(A) @ states.size, positive(np.abs(b)))
     for branch in _branches(program, tables, start, states.vertices(), plants, steps):
 
         def replay(x: Array, branch: _Branch = branch) -> tuple[Array, Array, tuple[Array, ...]]:
             noise = tuple(np.zeros(0) if d is None else d.at(x) for d in branch.noise)
-            run = _replay(mpc, branch.models, start.at(x), noise)
-            return A @ run[-1] - b, run, noise
+            run = [start.at(x)]
+            for model, d in zip(branch.models, noise, strict=True):
+                u = action(mpc, run[-1])
+                run.append(model.A @ run[-1] + model.B @ u + model.offset + model.E @ d)
+            return A @ run[-1] - b, np.array(run), noise
 
-        worst.maximise(branch.program, branch.p.times(A).plus(-b), replay, seconds)
-    return worst.answer()
+        _maximise(answer, branch.program, branch.p.times(A).plus(-b), sizes, replay, seconds)
+    return answer
 
 
 class _Branch(NamedTuple):
@@ -254,58 +254,40 @@ def _branches(
             yield rest._replace(models=(model, *rest.models), noise=(d, *rest.noise))
 
 
-class _Worst:
-    """The largest of several maxima, each replayed by the policies; ``run`` has no point yet."""
-
-    def __init__(self, question: str, digest: str, run: Array) -> None:
-        self.question, self.digest, self.run, self.noise = question, digest, run, ()
-        self.value, self.bound, self.nodes, self.binaries = -np.inf, -np.inf, 0, 0
-        self.began = time.perf_counter()
-
-    def maximise(
-        self,
-        program: Program,
-        rows: Affine,
-        replay: Callable[[Array], tuple[Array, Array, tuple[Array, ...]]],
-        seconds: float,
-    ) -> None:
-        """Maximise each row; ``replay`` maps variables to all rows' values, the run and its d."""
-        self.binaries = max(self.binaries, program.binaries)
-        for i in range(len(rows.constant)):
-            maximum = program.maximise(rows.part([i]), seconds=seconds)
-            self.bound, self.nodes = max(self.bound, maximum.bound), self.nodes + maximum.nodes
-            if not np.isfinite(maximum.value):
-                continue
-            values, run, noise = replay(maximum.x)
-            if abs(values[i] - maximum.value) > AGREEMENT * (1 + abs(values[i])):
-                raise SolverError(
-                    f"The policy gives {values[i]:.6g} where the program says {maximum.value:.6g}: "
-                    "the program's tolerances are too wide for this QP. Scale the states to "
-                    "numbers of order one, or lower the prices w of soft rows."
-                )
-            if values.max() > self.value:
-                self.value, self.run, self.noise = float(values.max()), run, noise
-
-    def answer(self) -> Answer:
-        seconds = time.perf_counter() - self.began
-        of = self.value, self.bound, self.run, self.noise, seconds, self.nodes, self.binaries
-        return Answer(self.question, *of, self.digest)
+def _maximise(
+    answer: Answer,
+    program: Program,
+    rows: Affine,
+    sizes: Array,
+    replay: Callable[[Array], tuple[Array, Array, tuple[Array, ...]]],
+    seconds: float,
+) -> None:
+    """Maximise rows of these sizes; ``replay`` maps variables to all rows, the run and its d."""
+    began, answer.binaries = time.perf_counter(), max(answer.binaries, program.binaries)
+    for i in range(len(rows.constant)):
+        maximum = program.maximise(rows.part([i]), seconds=seconds)
+        answer.bound, answer.nodes = max(answer.bound, maximum.bound), answer.nodes + maximum.nodes
+        answer.proved &= bool(maximum.bound <= TOLERANCE * sizes[i])
+        if not np.isfinite(maximum.value):
+            continue
+        values, run, noise = replay(maximum.x)
+        if abs(values[i] - maximum.value) > AGREEMENT * (sizes[i] + abs(values[i])):
+            raise SolverError(
+                f"The policy gives {values[i]:.6g} where the program says {maximum.value:.6g}: "
+                "the program's tolerances are too wide for this QP. Scale the states to "
+                "numbers of order one, or lower the prices w of soft rows."
+            )
+        answer.refuted |= bool((values > TOLERANCE * sizes).any())
+        if values.max() > answer.value:
+            answer.value, answer.states, answer.disturbances = float(values.max()), run, noise
+    answer.seconds += time.perf_counter() - began
 
 
 def _reached(program: Program, p: Affine) -> Polytope:
     """Return a box that contains p, by linear programs."""
-    ends = []
+    ends, sizes = [], np.abs(p.matrix).sum(1) + np.abs(p.constant)
     for sign in (-1.0, 1.0):
-        rows = p.times(sign * np.eye(len(p.constant)))
-        most = [program.maximise(rows.part([i]), relaxed=True) for i in range(len(p.constant))]
-        ends.append(sign * np.array([x.bound + TOLERANCE for x in most]))
+        rows = [p.times(sign * row[None]) for row in np.eye(len(sizes))]
+        most = [program.maximise(row, relaxed=True).bound for row in rows]
+        ends.append(sign * (np.array(most) + TOLERANCE * sizes))
     return Polytope.box(*ends)
-
-
-def _replay(mpc: QPMPC, models: Sequence[Plant], p: Array, noise: Sequence[Array]) -> Array:
-    """Run the policy on the plants from p; return the states."""
-    states = [p]
-    for model, d in zip(models, noise, strict=True):
-        p = model.A @ p + model.B @ action(mpc, p) + model.offset + model.E @ d
-        states.append(p)
-    return np.array(states)
