@@ -15,14 +15,13 @@ def up_to_date() -> bool:
 
 
 def compile_kernels() -> None:
-    """Train briefly, solve a QP of large numbers, identify a model, and order vectors."""
+    """Train briefly, solve a QP of large numbers, and identify a model."""
     import numpy as np
 
     import train
     from tests.campaign.families import FAMILIES, Draw
     from tests.runs import SMALL, make_config
     from torch_qpmpc import identify, solve_qp
-    from torch_qpmpc.qp.solvers.daqp import tour
 
     with tempfile.TemporaryDirectory() as folder:
         train.train(make_config(*SMALL, "optimizer=gauss_newton"), folder, quiet=True)
@@ -30,7 +29,6 @@ def compile_kernels() -> None:
     solve_qp(case.known.qp, case.known.fixed, solver="daqp")
     y, u = np.random.default_rng(0).normal(size=(2, 40))
     identify({"y": y, "u": u}, 1, order=1)
-    tour(np.zeros((1, 1)), 1)
     DONE.parent.mkdir(exist_ok=True)
     DONE.touch()
 

@@ -223,8 +223,8 @@ def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
     expected, whole = mpc.solve(s), interior_point.solve
     for wrong in (slice(None, None, 2), slice(None)):
 
-        def spoilt(qps: Any, wrong: slice = wrong) -> Any:
-            answer = whole(qps)
+        def spoilt(qps: Any, target: float, wrong: slice = wrong) -> Any:
+            answer = whole(qps, target)
             answer.v[wrong] = torch.nan
             return answer
 

@@ -216,7 +216,7 @@ class Levels:
             # A power of two, as each is kept.
             size = (np.abs(self.values).max(-1)[:, None] / of_rows[0, self.rows]).max()
             least = 2.0 ** np.ceil(np.log2(CURVATURE * slope / size))
-        K, unit, _, to_free = prepared.dual(n_f, float(least))
+        K, unit, _, to_free, _ = prepared.dual(n_f, float(least))
         scale, unit = unit[group], unit * of_rows[:, of] / root  # the latter in all original units
         lb, ub = prepared.theta.lb[:, of], prepared.theta.ub[:, of]
         with np.errstate(invalid="ignore"):

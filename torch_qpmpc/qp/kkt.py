@@ -185,7 +185,7 @@ def _solve_active(
     """
     group = to_tensor(programs.group)
     dual = programs.prepared.dual(programs.n_f)
-    _, unit, inverse, to_v = map(to_tensor, dual)
+    _, unit, inverse, to_v, _ = map(to_tensor, dual)
     unit, rows = unit[group], to_tensor(programs.prepared.reduced(programs.n_f).rows)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
     held, size = active[:, rows], largest(right_v) * 0

@@ -39,18 +39,6 @@ def upper_share(z: Tensor, lam: Tensor, G: Tensor, lb: Tensor, ub: Tensor) -> Te
     return (1 + side.nan_to_num().sign()) / 2  # NaN where both bounds are infinite
 
 
-def row_states(p: Tensor, lower: Tensor, upper: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return each row's nearest bound, True if it is active there, and its multiplier.
-
-    The excess of ``p = y + lam`` over the bounds, clipped to [-w, w], is the multiplier.
-    """
-    bound = p.clip(lower, upper)
-    excess = p - bound
-    multiplier = excess.clip(-w, w)
-    active = (multiplier == excess) & ((excess != 0) | (lower == upper))
-    return bound, active, multiplier
-
-
 @dataclass(frozen=True, repr=False)
 class QPSolution:
     """Primal-dual solution of a batch of QPs.

@@ -124,13 +124,14 @@ def test_in_the_order_of_its_rows_C_gives_the_prediction_form():
 def test_multipliers_give_the_solution_and_its_rows(r):
     root, G = normal(2, 5, 5), normal(2, r, 5, seed=1)
     H = root @ root.mT
-    K, unit, inverse, rows = map(torch.from_numpy, dual(H.numpy(), G.numpy()))
+    K, unit, inverse, rows, shift = map(torch.from_numpy, dual(H.numpy(), G.numpy()))
     g, lam = normal(5, seed=2), normal(r, seed=3)
     for m in range(2):
         v = torch.linalg.solve(H[m], -g - G[m].mT @ (lam / unit[m]))
         assert_close(-inverse[m] @ g - rows[m].mT @ lam, v)
         assert_close((-rows[m] @ g - K[m] @ lam) * unit[m], G[m] @ v)
         assert_close(K[m].diagonal(), torch.ones(r).double())
+    assert (shift == 0).all()
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])

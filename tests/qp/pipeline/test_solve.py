@@ -167,19 +167,25 @@ def test_inaccurate_answers_are_sharpened_or_of_many_solved_again(monkeypatch, n
     assert solution.residual.max() < 1e-9
 
 
-def test_only_rejected_solutions_are_solved_again(monkeypatch, asked):
+def test_only_rejected_solutions_are_solved_again(monkeypatch):
     wrong = np.array([False, True, False, False, True, True])
 
     def lie(answer: BackendSolution) -> BackendSolution:
         return answer._replace(v=answer.v + wrong[:, None])
 
-    monkeypatch.setitem(BACKENDS, "torch", BACKENDS["recorder"])
+    counts, recalled = [], Programs.recalled
+
+    def recording(programs: Programs, active: np.ndarray) -> BatchSolution:
+        counts.append(len(programs))
+        return recalled(programs, active)
+
+    monkeypatch.setattr(Programs, "recalled", recording)
     monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
     known = known_qp(1, batch=(BATCH,), matrices=(BATCH,))
     with SolveLog() as log:
         solution = solve(known, solver="liar")
     assert_right(solution, known)
-    assert counts(asked) == [3]
+    assert counts == [3]
     assert log.fallback == 3
 
 
@@ -274,6 +280,8 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(BACKENDS):
         monkeypatch.setitem(BACKENDS, name, doctored(LIES["zeros"]))
     monkeypatch.setattr(refinement, "MAX_SETS", 0)
+    lost = lambda self, active: self.unsolved(Status.NOT_CONVERGED)  # noqa: E731
+    monkeypatch.setattr(Programs, "recalled", lost)
 
 
 @pytest.mark.usefixtures("nobody_solves")

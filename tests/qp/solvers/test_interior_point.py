@@ -5,16 +5,14 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from torch import Tensor
-from torch.testing import assert_close
 
 from tests.campaign.families import Draw, zero_H
-from tests.problems import known_qp, programs_of, soft_qps
+from tests.problems import known_qp, programs_of, soft_qps, times
 from torch_qpmpc import QPMPC, SolveLog
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.solvers import BackendSolution, interior_point
-from torch_qpmpc.qp.solvers.interior_point import SETTLED, BatchedQPs, settle
 
-MAX_ITERATIONS = sum(limit + interior_point.LAST_STEPS for _, limit in interior_point.TARGETS)
+MAX_ITERATIONS = interior_point.LIMIT
 COUNT = 32
 
 
@@ -89,7 +87,8 @@ def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
 def test_linear_programs_with_bounds_that_are_far_away(seed):
     """Bounds of 1e3 to 1e20 beside others: no length follows from a cost without curvature."""
     programs = programs_of(zero_H(Draw(seed), 128).known).scaled()
-    answer = programs.recover(interior_point.solve_arrays(programs.reduced_qps()))
+    found = programs.recover(interior_point.solve_arrays(programs.reduced_qps()))
+    answer = programs.recalled(found.active)
     assert (answer.status == 0).all()
 
 
@@ -108,7 +107,19 @@ def moved(qps: SoftQPs, device: str) -> SoftQPs:
 
 
 def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
-    return BatchedQPs.of(qps).residual(answer.v, answer.lam)
+    """Return the relative KKT residual, ``(B,)``."""
+    (v, lam, _), hard = answer, qps.w.isinf()
+    Hv, y = torch.einsum("bde,be->bd", qps.H[qps.group], v), times(qps.G[qps.group], v)
+    forces = torch.stack((Hv, qps.g, torch.einsum("brd,br->bd", qps.G[qps.group], lam)))
+    outside = (y - y.clip(qps.l, qps.u)).abs()
+    charge = outside * qps.w.masked_fill(hard, 0)
+    up, down = qps.u.nan_to_num(posinf=0) - y, qps.l.nan_to_num(neginf=0) - y
+    gap = (charge + lam.clamp(min=0) * up + lam.clamp(max=0) * down).abs().sum(-1)
+    cost = (v * (Hv / 2 + qps.g)).sum(-1) + charge.sum(-1)
+    slope = forces.sum(0).abs().amax(-1) / (1 + forces.abs().amax((0, -1)))
+    over = ((lam.abs() - qps.w).clamp(min=0) / (1 + qps.w.masked_fill(hard, 0))).amax(-1)
+    errors = slope, (outside * hard / (1 + y.abs())).amax(-1), over, gap / (1 + cost.abs())
+    return torch.stack(errors).amax(0)
 
 
 @pytest.mark.parametrize("count", [1, 7])
@@ -116,12 +127,12 @@ def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
 @pytest.mark.parametrize("weight", [1e-2, 1.0, 1e4])
 def test_rows_of_all_kinds_at_once(count, matrices, weight):
     batch = (count,)
-    qps, exact = soft_qps(
+    qps, known = soft_qps(
         known_qp(1, batch=batch, matrices=batch if matrices else (), weight=weight)
     )
     answer = interior_point.solve(qps)
-    assert_allclose(answer.v, exact.v, atol=1e-8)
-    assert_allclose(answer.lam, exact.lam, atol=1e-8 * max(weight, 1.0))
+    assert_allclose(answer.v, known.v, atol=1e-7 * max(weight, 1.0))
+    assert_allclose(answer.lam, known.lam, atol=1e-7 * max(weight, 1.0))
 
 
 def as_tensors(**arrays: np.ndarray) -> SoftQPs:
@@ -159,7 +170,7 @@ def test_vertices_dependent_rows_and_flat_costs(d, rank):
     for seed in range(6):
         qps = random_qps(seed, d=d, rank=rank)
         answer = interior_point.solve(qps)
-        assert residual(qps, answer).max() <= SETTLED
+        assert residual(qps, answer).max() <= 1e-7
         assert answer.iterations.max() <= 40
 
 
@@ -243,20 +254,6 @@ def test_without_a_solution_the_answer_is_finite_and_soon(case):
     assert answer.lam.isfinite().all()
     assert answer.iterations.max() <= MAX_ITERATIONS
     assert residual(qps, answer).min() > 1e-3
-
-
-# Its active-set steps
-
-
-def test_settling_keeps_the_better_solution():
-    qps = random_qps(9)
-    form, cold = BatchedQPs.of(qps), interior_point.solve(qps)
-    v, lam = cold.v, cold.lam
-    for noise in (0.0, 1e-6, 1.0):
-        near = v + noise * torch.randn(v.shape, generator=torch.Generator().manual_seed(0)).double()
-        found = settle(form, near, lam, 2)
-        assert (found.residual <= form.residual(near, lam)).all()
-        assert_close(found.residual, form.residual(found.v, found.lam), rtol=0, atol=1e-15)
 
 
 # One code for all devices

@@ -28,6 +28,8 @@ TOLERANCE, ROUNDING = 1e-13, 4e-15
 DEPENDENT, NOISE = 1e-11, 1e-9
 #: A violation up to this fraction of a row's terms does not prove that no y is feasible.
 FEASIBLE = 1e-8
+#: Proximal steps, of a singular H.
+PROXIMAL_STEPS = 4
 #: The most changes of the active set.
 MAX_STEPS = 2000
 
@@ -43,27 +45,34 @@ def recall(active, dual, group, fixed, theta, reduced, sizes):
     B, (r, d), w = len(fixed), reduced.G.shape[1:], reduced.w
     g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), sizes.spans[0][:0]
     g = g_l_u[:, :d].copy()
-    v, free = -products(dual.inverse, group, g, spans), -products(dual.rows, group, g, spans)
-    lam, steps = np.zeros((B, r)), np.ones(B, np.int64)
+    v, lam, steps = g, np.zeros((B, r)), np.ones(B, np.int64)
     low, high, weight, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
-    side, held, factor = np.zeros(r, np.int64), np.empty(r, np.int64), np.empty((r, r))
+    sides, held, factor = np.zeros((B, r), np.int64), np.empty(r, np.int64), np.empty((r, r))
     for i in range(B):
-        K, unit, i_w = dual.K[group[i]], dual.unit[group[i]], i % len(w)
         for j in range(r):
-            low[j], high[j] = g_l_u[i, d + j] / unit[j], g_l_u[i, d + r + j] / unit[j]
-            weight[j], side[j] = w[i_w, j] * unit[j], active[i, reduced.rows[j]]
-        if r and np.abs(side).max() > 2:  # unknown
-            side[:] = 0
-        # Once more from the last set: of one set, the solution is the same whatever led to it.
-        for _ in range(2):
-            n = _begin(K, low, high, weight, lam[i], side, held, factor, x)
-            n, _, changes = solve(
-                K, free[i], low, high, weight, lam[i], y, side, held, n, factor, x, np.inf
-            )
-            if changes == 1:
-                break
-            steps[i] += changes - 1
-    v -= transposed_products(dual.rows, group, lam, spans)
+            sides[i, j] = active[i, reduced.rows[j]]
+        if r and np.abs(sides[i]).max() > 2:  # unknown
+            sides[i] = 0
+    for _ in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 1):
+        v, free = -products(dual.inverse, group, g, spans), -products(dual.rows, group, g, spans)
+        for i in range(B):
+            K, unit, i_w, side = dual.K[group[i]], dual.unit[group[i]], i % len(w), sides[i]
+            for j in range(r):
+                low[j], high[j] = g_l_u[i, d + j] / unit[j], g_l_u[i, d + r + j] / unit[j]
+                weight[j] = w[i_w, j] * unit[j]
+            # Once more from the last set: of one set, the solution is that whatever led to it.
+            for _ in range(2):
+                n = _begin(K, low, high, weight, lam[i], side, held, factor, x)
+                n, _, changes = solve(
+                    K, free[i], low, high, weight, lam[i], y, side, held, n, factor, x, np.inf
+                )
+                if changes == 1:
+                    break
+                steps[i] += changes - 1
+        v -= transposed_products(dual.rows, group, lam, spans)
+        for i in range(B):
+            for j in range(d):
+                g[i, j] = g_l_u[i, j] - dual.shift[group[i]] * v[i, j]
     for i in range(B):
         for j in range(r):
             lam[i, j] /= dual.unit[group[i], j]

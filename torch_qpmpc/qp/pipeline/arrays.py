@@ -136,13 +136,14 @@ class BatchSolution(NamedTuple):
             own[index] = new
 
     def improve(self, index: np.ndarray, others: BatchSolution) -> None:
-        """Replace solutions that are not converged, at ``index``, by others that are better.
+        """Replace solutions at ``index`` by others that are better.
 
         Those are solved, or proved to have no solution, or have a smaller residual, which is what a
         refinement starts from: an infinite error of the value may be due to rounding alone.
         """
-        better = (others.status != Status.NOT_CONVERGED) | (others.residual < self.residual[index])
-        better = np.flatnonzero(better)
+        left, right = (x == Status.NOT_CONVERGED for x in (self.status[index], others.status))
+        smaller = others.residual < self.residual[index]
+        better = np.flatnonzero(np.where(left == right, smaller, left))
         self.put(index[better], others.at(better))
 
 

@@ -30,8 +30,11 @@ ABSENT = 1e-15
 DEFINITE = 1e-11
 #: .. and that this fraction of it is added for the bound of a value's error.
 SHIFT = 1e-10
+#: The least curvature of a proximal step, and its share of the largest one.
+PROXIMAL = 1e-5
 #: H is indefinite if an eigenvalue is below minus this fraction of the largest.
 CONVEX = 1e-9
+TINY = np.finfo(float).tiny
 
 
 class Elimination(NamedTuple):
@@ -138,13 +141,14 @@ class Dual(NamedTuple):
 
     In units ``unit`` ``(M, r)`` of the rows they are ``-rows g - K lam``, and ``K = G H^-1 G'``
     ``(M, r, r)`` has a unit diagonal. ``inverse`` is that of H, ``(M, d, d)``, ``rows = G H^-1``,
-    ``(M, r, d)``.
+    ``(M, r, d)``. To a singular H `shift` ``(M,)`` is added, which proximal steps take back.
     """
 
     K: Array
     unit: Array
     inverse: Array
     rows: Array
+    shift: Array
 
 
 @np.errstate(all="ignore")  # predictions of unstable models may overflow
@@ -223,17 +227,20 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, condensed.spans)
 
 
-def inverse_factors(H: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def inverse_factors(
+    H: np.ndarray, share: float = SHIFT, least: float = TINY
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the inverses of the Cholesky factors of H ``(M, d, d)``, and the shifts ``(M,)``.
 
-    A singular H is shifted by a multiple of I. The inverse is inf if that has no factor either.
+    A singular H is shifted by this share of its largest entry, at least by ``least``. The inverse
+    is inf if that has no factor either.
     """
     matrices, one = torch.from_numpy(H), torch.eye(H.shape[-1], dtype=torch.float64)
     largest = H.diagonal(axis1=1, axis2=2).max(-1, initial=0.0)
     factors, failed = torch.linalg.cholesky_ex(matrices)
     pivots = factors.numpy().diagonal(axis1=1, axis2=2).min(-1, initial=np.inf) ** 2
     singular = (failed.numpy() > 0) | ~(pivots > DEFINITE * largest)
-    shift = np.where(singular, np.maximum(SHIFT * largest, np.finfo(float).tiny), 0.0)
+    shift = np.where(singular, np.maximum(share * largest, least), 0.0)
     if singular.any():
         shifted = matrices + torch.from_numpy(shift)[:, None, None] * one
         factors, failed = torch.linalg.cholesky_ex(shifted)
@@ -250,12 +257,12 @@ def _index_of(rows: np.ndarray) -> np.ndarray:
 
 @np.errstate(all="ignore")
 def dual(H: np.ndarray, G: np.ndarray) -> Dual:
-    """Return the `Dual` of reduced QPs; that of a singular H is of one that is shifted."""
-    inverse, _ = inverse_factors(H)
+    """Return the `Dual` of reduced QPs."""
+    inverse, shift = inverse_factors(H, PROXIMAL, PROXIMAL)
     R = G @ inverse.swapaxes(1, 2)
     unit = np.linalg.norm(R, axis=-1)
     R = R / unit[:, :, None]
-    return Dual(R @ R.swapaxes(1, 2), unit, inverse.swapaxes(1, 2) @ inverse, R @ inverse)
+    return Dual(R @ R.swapaxes(1, 2), unit, inverse.swapaxes(1, 2) @ inverse, R @ inverse, shift)
 
 
 def convex(H: np.ndarray) -> np.ndarray:

@@ -31,6 +31,7 @@ from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, interior_point
+from torch_qpmpc.qp.solvers.interior_point import EARLY
 
 #: Backends that solve again, cold, what the chosen one leaves: they give up soonest, and solve all
 #: that ProxQP solves. The last is the same for each: none decides whether there is a solution.
@@ -233,14 +234,14 @@ def solve_programs(
     ``start`` are active sets ``(B, n_g)`` of nearly equal QPs, see `Programs.recalled`; a
     ``device`` makes the first attempt.
     """
-    if (count := max(map(len, programs.theta[:3]))) > TOGETHER:
+    if (count := max(map(len, programs.prepared.theta[:3]))) > TOGETHER:
         solution = programs.unsolved(Status.NOT_CONVERGED)
         for index in np.array_split(programs.group.argsort(kind="stable"), -(-count // TOGETHER)):
             own = None if start is None else start[index]
             solution.put(index, solve_programs(programs.take(index), solver, own, device))
         return solution
     began, log = time.perf_counter(), _active_log.get(unused := SolveLog())
-    steps = steps_of(solver, log, start is not None, device)
+    steps = steps_of(solver, log, len(programs.group), start is not None, device)
     if (units := programs.prepared.units) is None:
         solution = _solved(programs, steps, start)
     else:
@@ -279,9 +280,9 @@ def _solved(programs: Programs, steps: list[Step], start: np.ndarray | None) -> 
 
 
 def steps_of(
-    solver: str, log: SolveLog, warm: bool = False, device: torch.device | None = None
+    solver: str, log: SolveLog, count: int, warm: bool = False, device: torch.device | None = None
 ) -> list[Step]:
-    """Return the steps of a solve, each for the QPs that the ones before leave.
+    """Return the steps of a solve of ``count`` QPs, each for those that the ones before leave.
 
     Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
     them after other eliminations, which solve whole batches.
@@ -291,11 +292,13 @@ def steps_of(
     first, *others, last = map(backed, solves)
     refined = partial(_refined, log)
     return [
-        *([backed(partial(interior_point.solve_arrays, device=device))] if device else []),
-        *([partial(_recalled, log)] if warm else []),
+        *([partial(_warm, log)] if warm else []),
+        *([_recalled] if solver == "daqp" and count > 1 else []),
+        *([partial(_early, device)] if solver == "torch" else []),
         first,
         partial(_if_few, refined),
         partial(_counted, log),
+        _recalled,
         partial(_if_few, _diagnosed),
         *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
         refined,
@@ -319,9 +322,22 @@ def backed(solve: Backend, passes: int = 0) -> Step:
     return step
 
 
-def _recalled(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
-    """Solve from the candidates' active sets."""
-    answer = programs.recalled(best.active)
+def _early(device: torch.device | None, programs: Programs, best: BatchSolution) -> BatchSolution:
+    """Solve by the interior point until it shows the active sets, and from these."""
+    solve = partial(interior_point.solve_arrays, device=device or "cpu", target=EARLY)
+    answer = backed(solve)(programs, best)
+    recalled = programs.recalled(answer.active)._replace(iterations=answer.iterations)
+    answer.improve(np.arange(len(programs)), recalled)
+    return answer
+
+
+def _recalled(programs: Programs, best: BatchSolution | None) -> BatchSolution:
+    """Solve from the candidates' active sets, or from empty ones."""
+    return programs.recalled((best or programs.unsolved(Status.NOT_CONVERGED)).active)
+
+
+def _warm(log: SolveLog, programs: Programs, best: BatchSolution) -> BatchSolution:
+    answer = _recalled(programs, best)
     log.recalled += int((answer.status == Status.SOLVED).sum())
     return answer
 

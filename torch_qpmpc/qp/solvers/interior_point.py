@@ -9,12 +9,8 @@ Mehrotra's method (1992, doi:10.1137/0802028) reduces both products together. El
 by side leaves ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t / mu``: an
 iteration costs one batched product and one d x d Cholesky factor, used twice. Infinite weights and
 bounds are huge numbers, whose pairs are inert; a hard equality, which has no interior, has a
-penalty and a multiplier of its own. Nothing loops over the batch.
-
-At the end, `settle` identifies the active set and solves for it. With fixed states of the rows (see
-`torch_qpmpc.qp.solution.row_states`), the KKT conditions are linear, and the method of multipliers
-solves them: a large curvature holds the active rows, and each pass reduces its error by orders of
-magnitude. One d x d Cholesky factor without pivoting suffices, even for dependent rows.
+penalty and a multiplier of its own. Nothing loops over the batch. From the active set that it
+finds early, `torch_qpmpc.qp.kernels.active_set` goes on.
 """
 
 from __future__ import annotations
@@ -27,7 +23,6 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels.batched import largest
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
-from torch_qpmpc.qp.solution import row_states
 
 #: The largest absolute entry along the last dimension, which is kept.
 _largest = partial(largest, keepdim=True)
@@ -47,14 +42,10 @@ FLAT = 1e-2
 PENALTY, DAMPING = 1e10, 1e-10
 #: Added to a matrix that is indefinite by rounding, relative to its largest diagonal entry.
 ROUNDING = 1e-12
-#: A solution with this relative residual needs no further step.
-SETTLED = 1e-9
-#: Passes of the method of multipliers per Newton step.
-MULTIPLIER_PASSES = 3
-#: Gaps, relative to a typical cost, at which active sets are tried, each with its iteration limit.
-TARGETS = ((1e-4, 40), (1e-8, 15), (1e-12, 10))
-#: Largest number of active-set steps at each gap.
-LAST_STEPS = 3
+#: Gaps, relative to a typical cost, that show an active set, and that end the method.
+EARLY, LAST = 1e-4, 1e-12
+#: The most iterations.
+LIMIT = 65
 #: Largest step, relative to that to the boundary.
 STEP = 0.995
 #: The initial distance of a side is at least this fraction of the row's width, ..
@@ -156,106 +147,30 @@ class BatchedQPs(NamedTuple):
             factor[failed] = torch.linalg.cholesky_ex(normal[failed])[0]
         return factor
 
-    def residual(self, v: Tensor, lam: Tensor) -> Tensor:
-        """Return the certificate's relative KKT residual for the reduced QPs, ``(B,)``."""
-        Hv, y, G_lam = self.apply_H(v), self.rows(v), self.apply_Gt(lam)
-        stationarity = _largest(Hv + self.g + G_lam)
-        stationarity /= 1 + _largest(torch.cat((Hv, self.g, G_lam), dim=-1))
-        hard = self.w == HUGE
-        weight, outside = self.w.masked_fill(hard, 0), (y - y.clip(self.lower, self.upper)).abs()
-        violation = _largest(outside * hard / (1 + y.abs()))
-        excess = _largest((lam.abs() - self.w).clamp(min=0) / (1 + weight))
-        charge = weight * outside
-        gap = charge + lam.clamp(min=0) * (self.upper - y) + lam.clamp(max=0) * (self.lower - y)
-        cost = (v * (Hv / 2 + self.g)).sum(-1, keepdim=True) + charge.sum(-1, keepdim=True)
-        gap = gap.abs().sum(-1, keepdim=True) / (1 + cost.abs())
-        errors = (stationarity, violation, excess, gap)
-        return torch.cat(errors, dim=-1).amax(-1).nan_to_num(torch.inf, torch.inf)
-
     def _multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
         if self.products is not None:
             return vectors @ matrices[0].mT
         return torch.bmm(matrices, vectors.unsqueeze(-1)).squeeze(-1)
 
 
-class Best(NamedTuple):
-    """The best v ``(B, d)`` and lam ``(B, r)`` so far, their residuals and steps, ``(B,)``."""
-
-    v: Tensor
-    lam: Tensor
-    residual: Tensor
-    steps: Tensor
-
-    def update(self, index: Tensor, v: Tensor, lam: Tensor, residual: Tensor) -> None:
-        """Take the solutions at ``index`` that lower the residual."""
-        better = residual < self.residual[index]
-        for best, new in ((self.v, v), (self.lam, lam), (self.residual, residual)):
-            mask = better.unsqueeze(-1) if best.ndim > 1 else better
-            best[index] = torch.where(mask, new, best[index])
-
-
-def settle(qps: BatchedQPs, v: Tensor, lam: Tensor, max_steps: int) -> Best:
-    """Take one or more Newton steps from v and lam, until the residual of each QP is `SETTLED`."""
-    todo = torch.arange(len(qps.g), device=v.device)
-    best = Best(v.clone(), lam.clone(), qps.residual(v, lam), torch.zeros_like(todo))
-    for _ in range(max_steps):
-        v, lam = _newton_step(qps, v, lam)
-        residual = qps.residual(v, lam)
-        best.update(todo, v, lam, residual)
-        best.steps[todo] += 1
-        going = (~(residual <= SETTLED)).nonzero().squeeze(-1)
-        if not len(going):
-            break
-        if len(going) < len(todo):
-            qps, todo, v, lam = qps.take(going), todo[going], v[going], lam[going]
-    return best
-
-
-def _newton_step(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """Return v and lam with active rows at their bounds, and fixed lam in the others."""
-    y, stiffness = qps.rows(v), qps.force / qps.width
-    nearest, active, multiplier = row_states(
-        y + lam / stiffness, qps.lower, qps.upper, qps.w / stiffness
-    )
-    lam = torch.where(active, lam, multiplier * stiffness)
-    weight = active * qps.penalty
-    factor = qps.factor(weight)
-    for _ in range(MULTIPLIER_PASSES):
-        short = nearest - y
-        right = qps.apply_Gt(weight * short - lam) - qps.apply_H(v) - qps.g
-        dv = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
-        dy = qps.rows(dv)
-        v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
-    return v, lam
-
-
 @torch.no_grad()
-def solve(qps: SoftQPs) -> BackendSolution:
+def solve(qps: SoftQPs, target: float = LAST) -> BackendSolution:
     """Solve a batch of tensors on their device.
 
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
     form = BatchedQPs.of(qps)
-    point, todo = _begin(form), torch.arange(len(form.g), device=qps.g.device)
-    unsolved = torch.full_like(form.cost, torch.inf)
-    best = Best(torch.zeros_like(form.g), torch.zeros_like(form.w), unsolved, point.steps.clone())
-    for target, limit in TARGETS:
-        if not len(todo):
-            break
-        before = point.steps.clone()
-        _follow(form, point, target, limit)
-        last = settle(form, point.v, point.lam, LAST_STEPS)
-        best.update(todo, last.v, last.lam, last.residual)
-        best.steps[todo] += last.steps + point.steps - before
-        going = (~(last.residual <= SETTLED)).nonzero().squeeze(-1)
-        form, point, todo = form.take(going), point.take(going), todo[going]
-    return BackendSolution(best.v, best.lam, best.steps)
+    point = _begin(form)
+    _follow(form, point, target)
+    return BackendSolution(point.v, point.lam, point.steps)
 
 
-def solve_arrays(qps: SoftQPs, device: torch.device | str = "cpu") -> BackendSolution:
+def solve_arrays(
+    qps: SoftQPs, device: torch.device | str = "cpu", target: float = LAST
+) -> BackendSolution:
     """Solve a batch of arrays on a device."""
     tensors = SoftQPs._make(torch.from_numpy(x).to(device) for x in qps)
-    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors))
+    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors, target))
 
 
 class Point(NamedTuple):
@@ -332,10 +247,10 @@ def _begin(qps: BatchedQPs) -> Point:
     )
 
 
-def _follow(qps: BatchedQPs, end: Point, target: float, limit: int) -> None:
-    """Iterate ``end`` in place until its gaps are below ``target``, at most ``limit`` times."""
+def _follow(qps: BatchedQPs, end: Point, target: float) -> None:
+    """Iterate ``end`` in place until its gaps are below ``target``, at most `LIMIT` times."""
     todo, point = torch.arange(len(qps.g), device=end.v.device), end
-    for _ in range(limit):
+    for _ in range(LIMIT):
         products = point.primal * point.dual
         gap = products.sum((1, 2, 3))
         going = ((gap > target * qps.cost) | (point.astray > target)) & ~point.lost

@@ -31,16 +31,11 @@ def solve(qps: SoftQPs) -> BackendSolution:
     batch = proxqp.sparse.BatchQP(n_qps)
     handles = []
     for m, g, lower, upper, w in zip(*qps[2:], strict=True):
-        qp = batch.init_qp_in_place(form.n_v + form.n_t, 0, form.n_rows + form.n_t)
-        _configure(qp.settings, form.paired)
         gradient, bounds = form.gradient(g, w), form.bounds(lower, upper, w)
+        qp = batch.init_qp_in_place(len(gradient), 0, len(bounds[0]))
+        _configure(qp.settings)
         # No preconditioner: it takes a third of the time of the solve and saves no iteration.
         qp.init(form.H[m], gradient, None, None, form.rows[m], *bounds, False)
-        if not form.paired:
-            # All slacks are zero, which their multipliers hold.
-            middle = _middle(qps.G[m], lower, upper, w)
-            qp.results.x = np.concatenate((middle, np.zeros(form.n_t)))
-            qp.results.z = np.concatenate((np.zeros(form.n_rows), -gradient[form.n_v :]))
         handles.append(qp)
     threads = torch.get_num_threads()
     if threads == 1 or n_qps == 1:
@@ -57,19 +52,7 @@ def solve(qps: SoftQPs) -> BackendSolution:
     )
 
 
-def _middle(G: np.ndarray, lower: np.ndarray, upper: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Return v in the middle of the hard bounds of its entries, and zero without them.
-
-    With little curvature, the unconstrained optimum is beyond almost all of them.
-    """
-    bounds = np.isinf(w) & np.isfinite(lower) & np.isfinite(upper) & ((G != 0).sum(-1) == 1)
-    row, entry = np.nonzero(G * bounds[:, None])
-    v = np.zeros(G.shape[1])
-    v[entry] = (lower[row] + upper[row]) / (2 * G[row, entry])
-    return v
-
-
-def _configure(settings: proxqp.Settings, paired: bool) -> None:
+def _configure(settings: proxqp.Settings) -> None:
     settings.eps_abs = EPS_ABS
     settings.eps_primal_inf = settings.eps_dual_inf = EPS_INFEASIBLE
     settings.check_duality_gap = True
@@ -78,11 +61,6 @@ def _configure(settings: proxqp.Settings, paired: bool) -> None:
     settings.max_iter, settings.max_iter_in = MAX_ITER, MAX_ITER_IN
     settings.nb_iterative_refinement = REFINEMENTS
     # The first guess is the unconstrained optimum, with slacks of -w / rho, and saves one iteration
-    # in ten. The two slacks of a row cancel, but a single one violates its row, and ProxQP adds all
-    # rows to its factor, up to 14 times as slow. The other guess is that of `_middle`.
-    guess = proxqp.InitialGuess
-    settings.initial_guess = (
-        guess.EQUALITY_CONSTRAINED_INITIAL_GUESS if paired else guess.WARM_START
-    )
-    # With GPDAL, the default, WARM_START's first factor is wrong: it has 0.95 mu instead of mu.
-    settings.merit_function_type = proxqp.MeritFunctionType.PDAL
+    # in ten. The two slacks of a row cancel: a single one violates its row, and ProxQP adds all
+    # such rows to its factor, up to 14 times as slow.
+    settings.initial_guess = proxqp.InitialGuess.EQUALITY_CONSTRAINED_INITIAL_GUESS

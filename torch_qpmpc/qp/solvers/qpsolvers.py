@@ -6,8 +6,7 @@ The split-slack form has soft rows as linear ones, for solvers with hard constra
     subject to            l <= G v - t+ + t- <= u,   0 <= t+, t-
 
 There is one slack per side instead of the paper's one sigma per row: the optimum is the same, and
-ProxQP needs half the iterations and reports no false infeasibility. Sides without a finite bound,
-and hard rows, have no slack.
+ProxQP needs half the iterations and reports no false infeasibility. Hard rows have no slack.
 """
 
 from __future__ import annotations
@@ -27,49 +26,36 @@ class SplitSlack:
 
     n_v: int
     n_rows: int
-    over: np.ndarray  # rows that have a t+
-    under: np.ndarray  # rows that have a t-
-    n_t: int  # slacks
+    soft: np.ndarray  # rows that have slacks
     H: list[scipy.sparse.csc_matrix]
     rows: list[scipy.sparse.csc_matrix]
 
     @classmethod
     def of(cls, qps: SoftQPs) -> SplitSlack:
         (n_rows, n_v), sp = qps.G.shape[1:], scipy.sparse
-        soft = np.isfinite(qps.w).any(axis=0)
-        over = np.flatnonzero(soft & np.isfinite(qps.u).any(axis=0))
-        under = np.flatnonzero(soft & np.isfinite(qps.l).any(axis=0))
-        n_t = len(over) + len(under)
-        unit = sp.csc_matrix(np.eye(n_rows))
-        slack = sp.hstack([-unit[:, over], unit[:, under]])
+        soft = np.flatnonzero(np.isfinite(qps.w).any(axis=0))
+        n_t, unit = 2 * len(soft), sp.csc_matrix(np.eye(n_rows))[:, soft]
+        slack = sp.hstack([-unit, unit])
         positive = sp.hstack([sp.csc_matrix((n_t, n_v)), sp.identity(n_t)])
         blank = sp.csc_matrix((n_t, n_t))
         return cls(
             n_v,
             n_rows,
-            over,
-            under,
-            n_t,
+            soft,
             [sp.csc_matrix(sp.block_diag([H, blank])) for H in qps.H],
             [sp.csc_matrix(sp.vstack([sp.hstack([G, slack]), positive])) for G in qps.G],
         )
 
-    @property
-    def paired(self) -> bool:
-        """True if each soft row has two slacks."""
-        return np.array_equal(self.over, self.under)
-
     def gradient(self, g: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the linear cost of x for one QP; a hard row's slack is fixed at zero."""
-        weight = np.where(np.isfinite(w), w, 0.0)
-        return np.concatenate([g, weight[self.over], weight[self.under]])
+        weight = np.where(np.isfinite(w), w, 0.0)[self.soft]
+        return np.concatenate([g, weight, weight])
 
     def bounds(
         self, lower: np.ndarray, upper: np.ndarray, w: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper bounds of the rows for one QP."""
-        limit = np.where(np.isfinite(w), np.inf, 0.0)
-        slack_upper = np.concatenate([limit[self.over], limit[self.under]])
+        slack_upper = np.tile(np.where(np.isfinite(w), np.inf, 0.0)[self.soft], 2)
         return (
             np.concatenate([lower, np.zeros_like(slack_upper)]),
             np.concatenate([upper, slack_upper]),
