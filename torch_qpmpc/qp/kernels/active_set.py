@@ -16,6 +16,7 @@ of K solves the linear KKT system of the derivatives.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -34,8 +35,8 @@ PROXIMAL_STEPS = 4
 MAX_STEPS = 2000
 
 
-@compiled
-def recall(active, dual, group, fixed, theta, reduced, sizes):
+@partial(compiled, nogil=True)
+def recall(active, group, fixed, dual, theta, reduced, sizes):
     """Solve QPs from active sets ``(B, n_g)``, complete and certify them.
 
     Returns:

@@ -241,6 +241,13 @@ class Programs:
             group, prepared = prepared.part(group, index)
         return Programs(prepared, group, self.fixed[index])
 
+    def one(self, i: int) -> Theta:
+        """Return a QP without a batch dimension, whose last equations are its fixed entries."""
+        H, C, G = (x[self.group[i] % len(x)] for x in self.theta[:3])
+        q, c, b, *rows = (x[i % len(x)] for x in self.theta[3:])
+        C = np.vstack((C, np.eye(self.n_f, C.shape[1])))
+        return Theta(H, C, G, q, c, np.concatenate((b, self.fixed[i])), *rows)
+
     def scaled(self) -> Programs:
         """Return the same QPs in their own units."""
         if (units := self.prepared.units) is None:
@@ -309,22 +316,27 @@ class Programs:
         The warm start of every solver, for the whole batch at once. Codes are those of
         `QPSolution.active`; a set with any other code starts as the empty one.
         """
-        dual = self.prepared.dual(self.n_f)
-        return BatchSolution(*active_set.recall(active, dual, *self.data()))
+        group, fixed, *qps = self.data()
+        rows = active, group, fixed
+        return self._in_threads(active_set.recall, rows, self.prepared.dual(self.n_f), *qps)
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
 
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
-        elimination. Many QPs of one theta take torch's number of threads.
+        elimination.
         """
-        rows, known = (*candidate, self.group, self.fixed), (*self.data()[2:], passes)
-        parts = min(torch.get_num_threads(), len(self) // MANY) if self.prepared.shared else 1
+        group, fixed, *qps = self.data()
+        return self._in_threads(sample.recover, (*candidate, group, fixed), *qps, passes)
+
+    def _in_threads(self, kernel: Callable, rows: Sequence[np.ndarray], *qps: Any) -> BatchSolution:
+        """Run a kernel; many QPs of one theta take torch's number of threads."""
+        parts = min(torch.get_num_threads(), len(rows[0]) // MANY) if self.prepared.shared else 1
         if parts < 2:
-            return BatchSolution(*sample.recover(*rows, *known))
+            return BatchSolution(*kernel(*rows, *qps))
         with ThreadPoolExecutor(parts) as pool:
             split = (np.array_split(x, parts) for x in rows)
-            found = pool.map(lambda *part: sample.recover(*part, *known), *split)
+            found = pool.map(lambda *part: kernel(*part, *qps), *split)
             return BatchSolution._make(map(np.concatenate, zip(*found, strict=True)))
 
     def data(self) -> tuple:

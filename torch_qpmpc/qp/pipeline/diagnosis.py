@@ -1,11 +1,10 @@
 """The cause of an unsolved QP (eq:qp2, eq:qp3): infeasible, unbounded, or not converged.
 
-A diagnosis needs a proof in the QP's own numbers, checked in all entries of z. A proof that could
-result from rounding, or that has an error larger than rounding, does not count:
+A diagnosis needs a proof in the QP's own numbers, in which the fixed entries are equations of C. A
+proof that could result from rounding, or that has an error larger than rounding, does not count:
 
 * *Infeasible* (Farkas' lemma): multipliers chi and lam of the hard rows with ``C'chi + G'lam = 0``
-  except in the fixed entries, and ``b'chi + ub'max(lam, 0) - lb'max(-lam, 0) < 0``, which every
-  feasible z makes non-negative.
+  and ``b'chi + ub'max(lam, 0) - lb'max(-lam, 0) < 0``, which every feasible z makes non-negative.
 * *Unbounded*: a feasible point, and a direction d with ``H d = 0`` and ``C d = 0`` that no hard row
   limits and along which the cost decreases.
 
@@ -16,12 +15,12 @@ elimination is ill-conditioned.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
-from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, Theta
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.condensing import null_space
 from torch_qpmpc.qp.program import TOLERANCE, Status
@@ -34,68 +33,24 @@ def diagnose(programs: Programs) -> np.ndarray:
     """Return the `Status` of each QP, ``(B,)``: INFEASIBLE, UNBOUNDED or NOT_CONVERGED."""
     n_f, ranges, statuses = programs.n_f, {}, []
     for i, m in enumerate(programs.group.tolist()):
-        H, C, G = (x[m % len(x)] for x in programs.theta[:3])
-        q, _, b, lb, ub, w = (x[i % len(x)] for x in programs.theta[3:])
-        qp = _FreeQP.of(H, q, C, b, G, lb, ub, w, programs.fixed[i])
-        ranges[m] = ranges.get(m) or _Range.of(C[:, n_f:])
+        qp = programs.one(i)
+        q, free = qp.q + qp.H[:, :n_f] @ programs.fixed[i], qp.H[n_f:, n_f:]
+        qp = qp._replace(H=np.pad(free, (n_f, 0)), q=q)  # in the rest of z, the fixed are linear
+        if m not in ranges:
+            T, Y, *_ = null_space(qp.C[None], 0)
+            ranges[m] = _Range(Y[0], T[0])
         statuses.append(int(_status(qp, ranges[m])))
     return np.array(statuses, np.int64)
 
 
-@dataclass(frozen=True)
-class _Range:
-    """The pseudo-inverse of C ``(n, n_c)``, and its orthonormal null space ``(n, d)``."""
+class _Range(NamedTuple):
+    """The pseudo-inverse of C ``(n_z, n_c)``, and its orthonormal null space ``(n_z, d)``."""
 
     inverse: np.ndarray
     null: np.ndarray
 
-    @classmethod
-    def of(cls, C: np.ndarray) -> _Range:
-        T, Y, *_ = null_space(C[None], 0)
-        return cls(Y[0], T[0])
 
-
-@dataclass(frozen=True)
-class _FreeQP:
-    """One QP in the entries of z that are not fixed.
-
-    The contribution of the fixed entries is subtracted from ``b``, ``lb`` and ``ub``. Rounding
-    errors are relative to ``b_size``, ``lb_size`` and ``ub_size``, the sums of absolute terms.
-    """
-
-    H: np.ndarray
-    q: np.ndarray
-    C: np.ndarray
-    b: np.ndarray
-    b_size: np.ndarray
-    G: np.ndarray
-    lb: np.ndarray
-    lb_size: np.ndarray
-    ub: np.ndarray
-    ub_size: np.ndarray
-    w: np.ndarray
-
-    @classmethod
-    def of(cls, H, q, C, b, G, lb, ub, w, fixed) -> _FreeQP:
-        n_f, size = len(fixed), np.abs(fixed)
-        of_C, of_G = C[:, :n_f] @ fixed, G[:, :n_f] @ fixed
-        C_size, G_size = np.abs(C[:, :n_f]) @ size, np.abs(G[:, :n_f]) @ size
-        return cls(
-            H=H[n_f:, n_f:],
-            q=q[n_f:] + H[n_f:, :n_f] @ fixed,
-            C=C[:, n_f:],
-            b=b - of_C,
-            b_size=np.abs(b) + C_size,
-            G=G[:, n_f:],
-            lb=lb - of_G,
-            lb_size=np.abs(lb) + G_size,
-            ub=ub - of_G,
-            ub_size=np.abs(ub) + G_size,
-            w=w,
-        )
-
-
-def _status(qp: _FreeQP, C_range: _Range) -> Status:
+def _status(qp: Theta, C_range: _Range) -> Status:
     z = C_range.inverse @ qp.b
     z = z + C_range.inverse @ (qp.b - qp.C @ z)
     no_rows = np.zeros(len(qp.w))
@@ -109,7 +64,7 @@ def _status(qp: _FreeQP, C_range: _Range) -> Status:
     return Status.NOT_CONVERGED
 
 
-def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.ndarray, np.ndarray]:
     """Return the feasible point nearest to z, where C z = b, and multipliers against feasibility.
 
     This is Lawson and Hanson's least distance programming: for rows ``A v >= h``, the residual of
@@ -148,7 +103,7 @@ def _nearest_feasible(qp: _FreeQP, z: np.ndarray, C_range: _Range) -> tuple[np.n
 
 
 def _contradict(
-    qp: _FreeQP, chi: np.ndarray, lam: np.ndarray, z: np.ndarray, C_range: _Range
+    qp: Theta, chi: np.ndarray, lam: np.ndarray, z: np.ndarray, C_range: _Range
 ) -> bool:
     """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible.
 
@@ -164,8 +119,9 @@ def _contradict(
     # Zero multipliers are skipped: their bounds may be infinite.
     with np.errstate(invalid="ignore"):
         charge = np.where(up > 0, up * qp.ub, 0) - np.where(down > 0, down * qp.lb, 0)
-        terms = np.where(up > 0, up * qp.ub_size, 0) + np.where(down > 0, down * qp.lb_size, 0)
-    terms = terms.sum() + qp.b_size @ size
+        terms = np.where(up > 0, up * np.abs(qp.ub), 0)
+        terms += np.where(down > 0, down * np.abs(qp.lb), 0)
+    terms = terms.sum() + np.abs(qp.b) @ size
     residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
     of_z = np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down)
     terms += np.minimum(np.abs(z), reach) @ of_z
@@ -181,7 +137,7 @@ def _without_noise(x: np.ndarray, largest: float) -> np.ndarray:
     return np.where(np.abs(x) <= ROUNDING * largest, 0.0, x)
 
 
-def _reach(qp: _FreeQP) -> np.ndarray:
+def _reach(qp: Theta) -> np.ndarray:
     """Return the bounds of |z| by hard rows with one entry each; inf without such a row."""
     rows = np.isinf(qp.w) & ((qp.G != 0).sum(1) == 1)
     entry = qp.G[rows].nonzero()[1]
@@ -191,19 +147,19 @@ def _reach(qp: _FreeQP) -> np.ndarray:
     return reach
 
 
-def _is_feasible(qp: _FreeQP, z: np.ndarray) -> bool:
+def _is_feasible(qp: Theta, z: np.ndarray) -> bool:
     """True if z satisfies C z = b and the hard rows."""
     y, size = qp.G @ z, np.abs(qp.G) @ np.abs(z)
     beyond = np.maximum(qp.lb - y, y - qp.ub)[np.isinf(qp.w)]
     short = np.abs(qp.C @ z - qp.b)
-    C_size = np.abs(qp.C) @ np.abs(z) + qp.b_size
+    C_size = np.abs(qp.C) @ np.abs(z) + np.abs(qp.b)
     return bool(
         (short <= TOLERANCE * (1 + C_size)).all()
         and (beyond <= TOLERANCE * (1 + size[np.isinf(qp.w)])).all()
     )
 
 
-def _steepest_recession(qp: _FreeQP, C_range: _Range) -> np.ndarray:
+def _steepest_recession(qp: Theta, C_range: _Range) -> np.ndarray:
     """Return the direction in which the cost of an unbounded QP decreases fastest.
 
     It is the residual of the multipliers that best balance the slope; zero if they balance it.
@@ -233,7 +189,7 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return product
 
 
-def _falls(qp: _FreeQP, d: np.ndarray) -> bool:
+def _falls(qp: Theta, d: np.ndarray) -> bool:
     """True if the cost decreases without bound along d, by H, C and the hard rows."""
     d = _without_noise(d, np.abs(d).max(initial=0.0))
     y, size = qp.G @ d, np.abs(d)

@@ -18,7 +18,7 @@ import torch
 from torch_qpmpc.qp.kernels.batched import null_space_inverses
 from torch_qpmpc.qp.kernels.linalg import compiled
 from torch_qpmpc.qp.kernels.sample import CANCELLED, FLOOR
-from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, BatchSolution
+from torch_qpmpc.qp.pipeline.arrays import CONTRADICTED, BatchSolution, Theta
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import TOLERANCE, Status
 
@@ -68,77 +68,62 @@ def refine(
 
     Large QPs, for which all other ways together are quicker, are left until the ``last``.
     """
-    theta, group = programs.theta, programs.group
     if not last and sum(programs.theta.C.shape[1:]) ** 3 > MAX_WORK:
         return
     for i in which:
-        matrices = (x[group[i] % len(x)] for x in theta[:3])
-        vectors = (x[i % len(x)] for x in theta[3:])
-        qp = _QP._make((*matrices, *vectors, programs.fixed[i]))
         try:
-            refined = qp.solve(solution.z[i], solution.lam[i])
+            refined = _solve(programs.one(i), solution.z[i], solution.lam[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
         if refined is not None:
+            chi, xi = np.split(refined.chi, [solution.chi.shape[1]])
             iterations = solution.iterations[i] + refined.iterations
-            solution.put(i, refined._replace(iterations=iterations))
+            solution.put(i, refined._replace(chi=chi, xi=xi, iterations=iterations))
 
 
-class _QP(NamedTuple):
-    """One QP, see `torch_qpmpc.qp.program`."""
+@np.errstate(all="ignore")  # a set without a solution has none that is finite
+def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
+    """Solve from the active set of z and lam; return None if no set does."""
+    codes, slip, x = _first_codes(qp, z, lam), EXACT, None
+    work = (len(qp.q) + len(qp.b) + np.count_nonzero(codes)) ** 3
+    for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
+        system = _System.of(qp, codes)
+        x = system.solution(x if x is not None else system.start(z, lam))
+        if x is None:
+            return None
+        if system.solver.dependent:
+            slip = ROUNDING
+        point = _Point.of(qp, codes, x)
+        contradiction, states = point.contradictions(slip)
+        if not contradiction.any():
+            solution = point.judged(system.errors(x), sets)
+            return None if solution.status else solution
+        codes = np.where(contradiction > 0, states, codes)
+    return None
 
-    H: np.ndarray
-    C: np.ndarray
-    G: np.ndarray
-    q: np.ndarray
-    c: np.ndarray
-    b: np.ndarray
-    lb: np.ndarray
-    ub: np.ndarray
-    w: np.ndarray
-    fixed: np.ndarray
 
-    @np.errstate(all="ignore")  # a set without a solution has none that is finite
-    def solve(self, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
-        """Solve from the active set of z and lam; return None if no set does."""
-        codes, slip, x = self._first_codes(z, lam), EXACT, None
-        work = (len(self.q) + len(self.b) + np.count_nonzero(codes)) ** 3
-        for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
-            system = _System.of(self, codes)
-            x = system.solution(x if x is not None else system.start(z, lam))
-            if x is None:
-                return None
-            if system.solver.dependent:
-                slip = ROUNDING
-            point = _Point.of(self, codes, x)
-            contradiction, states = point.contradictions(slip)
-            if not contradiction.any():
-                solution = point.judged(system.errors(x), sets)
-                return None if solution.status else solution
-            codes = np.where(contradiction > 0, states, codes)
-        return None
+def _first_codes(qp: Theta, z: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    """Return codes as in `QPSolution.active`, by the larger of slack and multiplier.
 
-    def _first_codes(self, z: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """Return codes as in `QPSolution.active`, by the larger of slack and multiplier.
+    A row is held if its multiplier is larger than its distance from the bound, and saturated if
+    it is beyond by more than the multiplier is below w, all relatively.
+    """
+    force = np.abs(lam) * np.abs(qp.G).sum(-1)
+    share = force / max(force.max(initial=0.0), TINY)
+    bound, sign = np.where(lam > 0, qp.ub, qp.lb), np.sign(lam)
+    beyond = sign * (qp.G @ z - bound) / np.maximum(_row_sizes(qp, z), TINY)
+    held = (share > np.maximum(np.abs(beyond), WEAK)) | ((qp.lb == qp.ub) & (qp.w > 0))
+    below = 1 - np.abs(lam) / np.maximum(qp.w, TINY)
+    saturated = (qp.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
+    code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
+    return code.astype(np.int8)
 
-        A row is held if its multiplier is larger than its distance from the bound, and saturated if
-        it is beyond by more than the multiplier is below w, all relatively.
-        """
-        force = np.abs(lam) * np.abs(self.G).sum(-1)
-        share = force / max(force.max(initial=0.0), TINY)
-        bound, sign = np.where(lam > 0, self.ub, self.lb), np.sign(lam)
-        beyond = sign * (self.G @ z - bound) / np.maximum(self.row_sizes(z), TINY)
-        held = (share > np.maximum(np.abs(beyond), WEAK)) | ((self.lb == self.ub) & (self.w > 0))
-        below = 1 - np.abs(lam) / np.maximum(self.w, TINY)
-        saturated = (self.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
-        code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
-        return code.astype(np.int8)
 
-    def row_sizes(self, z: np.ndarray) -> np.ndarray:
-        """Return the size of the terms that each row compares: |G| |z|, and the nearer bound."""
-        y = self.G @ z
-        near = np.where(np.abs(y - self.lb) < np.abs(y - self.ub), self.lb, self.ub)
-        return np.abs(self.G) @ np.abs(z) + np.where(np.isfinite(near), np.abs(near), 0)
+def _row_sizes(qp: Theta, z: np.ndarray) -> np.ndarray:
+    """Return the size of the terms that each row compares: |G| |z|, and the nearer bound."""
+    y = qp.G @ z
+    near = np.where(np.abs(y - qp.lb) < np.abs(y - qp.ub), qp.lb, qp.ub)
+    return np.abs(qp.G) @ np.abs(z) + np.where(np.isfinite(near), np.abs(near), 0)
 
 
 class _System(NamedTuple):
@@ -151,19 +136,18 @@ class _System(NamedTuple):
     solver: _Solver
 
     @classmethod
-    def of(cls, qp: _QP, codes: np.ndarray) -> _System:
-        (n_c, n_z), n_g, n_f = qp.C.shape, len(qp.w), len(qp.fixed)
+    def of(cls, qp: Theta, codes: np.ndarray) -> _System:
+        (n_c, n_z), n_g = qp.C.shape, len(qp.w)
         held = np.flatnonzero(np.abs(codes) == 1)
-        top = np.hstack((qp.H, qp.C.T, qp.G.T))[n_f:]
+        top = np.hstack((qp.H, qp.C.T, qp.G.T))
         rows = np.vstack((qp.C, qp.G[held]))
         matrix = np.vstack((top, np.pad(rows, ((0, 0), (0, n_c + n_g)))))
         level = np.where(codes > 0, qp.ub, qp.lb)[held]
-        right = np.concatenate((-qp.q[n_f:], qp.b, level))
-        free = np.concatenate((np.arange(n_f, n_z + n_c), n_z + n_c + held))
+        right = np.concatenate((-qp.q, qp.b, level))
+        free = np.concatenate((np.arange(n_z + n_c), n_z + n_c + held))
         known = np.zeros(n_z + n_c + n_g)
-        known[:n_f] = qp.fixed
         known[n_z + n_c :] = np.where(np.abs(codes) == 2, np.sign(codes) * qp.w, 0)
-        solver = _Solver.of(matrix[:, free], n_z - n_f)
+        solver = _Solver.of(matrix[:, free], n_z)
         return cls(matrix, right, free, known, solver)
 
     def start(self, z: np.ndarray, lam: np.ndarray) -> Twice:
@@ -173,8 +157,7 @@ class _System(NamedTuple):
         if least is not None:
             shortest = np.abs(least.high[: len(z)]).max(initial=0.0)
             if np.abs(z).max(initial=0.0) <= RUNAWAY * shortest:
-                n_f = len(z) - len(self.solver.H)
-                x[n_f : len(z)] = z[n_f:]
+                x[: len(z)] = z
                 x[len(x) - len(lam) :] = lam
         return Twice(x, nothing)
 
@@ -235,7 +218,7 @@ class _Solver(NamedTuple):
 class _Point(NamedTuple):
     """A solution of the equations of an active set."""
 
-    qp: _QP
+    qp: Theta
     codes: np.ndarray
     z: Twice
     chi: Twice
@@ -244,7 +227,7 @@ class _Point(NamedTuple):
     slope: Twice
 
     @classmethod
-    def of(cls, qp: _QP, codes: np.ndarray, x: Twice) -> _Point:
+    def of(cls, qp: Theta, codes: np.ndarray, x: Twice) -> _Point:
         n_c, n_z = qp.C.shape
         ends = (n_z, n_z + n_c)
         z, chi, lam = map(Twice, *(np.split(part, ends) for part in x))
@@ -253,7 +236,7 @@ class _Point(NamedTuple):
     def contradictions(self, slip: float) -> tuple[np.ndarray, np.ndarray]:
         """Return how much each row contradicts its state, relatively, and the state it takes."""
         qp, codes = self.qp, self.codes
-        size = np.maximum(qp.row_sizes(self.z.high), TINY)
+        size = np.maximum(_row_sizes(qp, self.z.high), TINY)
         above, below = self.y.minus(qp.ub) / size, -self.y.minus(qp.lb) / size
         lam, sign = self.lam.high, np.sign(codes)
         row = np.abs(qp.G).sum(-1)
@@ -274,7 +257,7 @@ class _Point(NamedTuple):
     def judged(self, errors: np.ndarray, sets: int) -> BatchSolution:
         """Return the solution with its value and errors; ``errors`` are those of the equations."""
         qp, z, chi, lam = self.qp, self.z.high, self.chi.high, self.lam.high
-        n_f, n_c, hard = len(qp.fixed), len(qp.b), np.isinf(qp.w)
+        n_z, n_c, hard = len(z), len(qp.b), np.isinf(qp.w)
         beyond = np.maximum(np.maximum(self.y.minus(qp.ub), -self.y.minus(qp.lb)), 0)
         charge = np.where(hard, 0, qp.w * beyond)
         half = Twice(self.slope.high / 2, self.slope.low / 2)
@@ -284,20 +267,19 @@ class _Point(NamedTuple):
         scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
         bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
         gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
-        of_slope, of_C, _ = np.split(np.abs(errors), (len(z) - n_f, len(z) - n_f + n_c))
-        slip = of_slope @ np.abs(z[n_f:]) + np.abs(gap).sum() + of_C @ np.abs(chi)
+        of_slope, of_C, _ = np.split(np.abs(errors), (n_z, n_z + n_c))
+        slip = of_slope @ np.abs(z) + np.abs(gap).sum() + of_C @ np.abs(chi)
         force = np.stack((np.abs(qp.H) @ np.abs(z) + np.abs(qp.q), np.abs(qp.G.T) @ np.abs(lam)))
-        force = (force.sum(0) + np.abs(qp.C.T) @ np.abs(chi))[n_f:]
-        short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), qp.row_sizes(z)))
+        force = force.sum(0) + np.abs(qp.C.T) @ np.abs(chi)
+        short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), _row_sizes(qp, z)))
         # Rows that contradict each other are held in the middle: no further than is infeasible.
         off = np.concatenate((of_C, hard * beyond)) * (TOLERANCE / CONTRADICTED)
         residual = max(_ratio(of_slope, force), _ratio(off, short))
-        xi = -(self.slope.high + qp.q + qp.G.T @ lam + qp.C.T @ chi)[:n_f]
         error = slip / scale
         right = residual <= TOLERANCE and error <= TOLERANCE
         status = int(Status.SOLVED if right else Status.NOT_CONVERGED)
         certificate = status, residual, error, sets
-        return BatchSolution(cost + qp.c, z, chi, lam, xi, *certificate, self.codes)
+        return BatchSolution(cost + qp.c, z, chi, lam, chi[n_c:], *certificate, self.codes)
 
 
 def _ratio(errors: np.ndarray, sizes: np.ndarray) -> float:
