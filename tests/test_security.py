@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import os
 import re
 import shutil
 import sys
@@ -197,6 +198,10 @@ def test_files_are_written_beside_their_links_targets(tmp_path):
     for name in ("file", "file.partial", "policy.c", "policy.h", "mine.qpmpc"):
         (tmp_path / name).symlink_to(outside)
     write_whole(tmp_path / "file", b"ours")
+    os.mkfifo(tmp_path / "pipe")
+    for other in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(FileExistsError, match="is no file, and is left as it is"):
+            write_whole(other, b"ours")
     mpc = drawn_mpc(1, 1, 2, stage_weight=[1.0, 1.0])
     mpc.save(tmp_path / "mine.qpmpc")
     export_c(mpc, tmp_path)

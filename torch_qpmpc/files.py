@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import zipfile
@@ -23,6 +22,8 @@ VERSION = 2
 def write_whole(path: Path, data: bytes | memoryview) -> None:
     """Write ``data`` to ``path`` atomically; a symbolic link is replaced, not followed."""
     partial = path.with_name(f"{path.name}.partial")
+    if path.exists() and not (path.is_file() or path.is_symlink()):  # such as a device
+        raise FileExistsError(f"{path} is no file, and is left as it is.")
     try:
         partial.unlink(missing_ok=True)
         with partial.open("xb") as file:  # a new file: no link is followed
@@ -31,8 +32,7 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     except OSError:
-        with contextlib.suppress(OSError):
-            partial.unlink()
+        partial.unlink(missing_ok=True)
         raise
 
 
@@ -74,9 +74,9 @@ def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
         raise QPError.expected("path", got, expected, remedy)
     version = content.get("version")
     if not isinstance(version, int) or not 1 <= version <= VERSION:
-        got = f"{path}, whose format has version {version!r}"
+        got, want = f"{path}, whose format has version {version!r}", f"version 1 to {VERSION}"
         remedy = "A newer release wrote it: pip install --upgrade torch-qpmpc."
-        raise QPError.expected("path", got, f"version 1 to {VERSION}", remedy)
+        raise QPError.expected("path", got, want, remedy)
     return content
 
 
@@ -87,7 +87,6 @@ def damaged(
     remedy: str = "Restore the file, or move the run's folder elsewhere.",
 ) -> QPError:
     """Make the error of a ``file``, as of a run, that cannot be read."""
-    reason = " ".join(str(error).split()) or type(error).__name__
-    if isinstance(error, KeyError):
-        reason = f"it has no {error.args[0]}"
+    missing = f"it has no {error.args[0]}" if isinstance(error, KeyError) else ""
+    reason = missing or " ".join(str(error).split()) or type(error).__name__
     return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)

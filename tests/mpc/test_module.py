@@ -420,6 +420,15 @@ def test_a_released_module_can_be_copied_and_reset():
     assert_close(mpc.value(s), linear(free=0.0).value(s))
 
 
+def test_the_parameters_order_survives_a_release_and_a_copy():
+    """An optimiser loads its state by that order."""
+    mpc = drawn_mpc(1, 1, 3, structure="tied", step="projection", learn=("q", "b", "w", "c"))
+    mpc.release()
+    twin = copy.deepcopy(mpc)
+    assert [name for name, _ in mpc.named_parameters()] == ["q", "c", "b", "w"]
+    assert [name for name, _ in twin.named_parameters()] == ["q", "c", "b", "w"]
+
+
 def test_frozen_parameters_stay_frozen():
     mpc = linear(7)
     for name, parameter in mpc.named_parameters():

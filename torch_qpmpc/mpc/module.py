@@ -426,6 +426,9 @@ class QPMPC(nn.Module):
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
                 value = getattr(self, part).detach()
                 parameters.replace(self, part, self._parametrizations_for(part, value))
+        # In the order of a module that is made free, as optimisers load their state by it.
+        for part in [x for x in self.scheme.theta if x in self._parameters]:
+            self._parameters[part] = self._parameters.pop(part)
 
     @torch.no_grad()
     def project_(self) -> None:

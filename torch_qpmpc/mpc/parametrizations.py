@@ -297,9 +297,6 @@ def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
 
 def _check_tied(name: str, entries: Tensor, tied: Tensor) -> None:
     if not torch.equal(entries, tied):
-        raise QPError.expected(
-            name,
-            "entries that break the structure of a linear MPC scheme",
-            "entries that keep it",
-            "Call release() first to free them.",
-        )
+        got = "entries that break the structure of a linear MPC scheme"
+        remedy = "Call release() first to free them, or begin with structure='free'."
+        raise QPError.expected(name, got, "entries that keep it", remedy)
