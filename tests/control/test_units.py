@@ -38,6 +38,20 @@ def test_a_set_point_in_any_unit_is_tracked_and_the_design_is_sound(y, u, bounde
     assert np.allclose(x / y, r, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+def test_noise_costs_the_same_in_any_unit():
+    rng, found = np.random.default_rng(0), []
+    u, y = rng.uniform(-1, 1, 300), np.zeros((301, 2))
+    for k in range(300):
+        y[k + 1] = [0.9 * y[k, 0] + 0.1 * y[k, 1], 0.7 * y[k, 1] + u[k]]
+    y += 0.05 * rng.normal(size=y.shape)
+    for unit in (1.0, 1e-6, 1e6):
+        model = qm.identify({"y": y[:, :1] * unit, "u": u}, order=2)
+        weights = {"Q": 1 / unit**2, "dR": 0.1, "u_bounds": (-1.0, 1.0)}
+        found.append(qm.Controller(qm.LinearMPC(model, 10, **weights)).review()["noise"].text)
+    assert found[0] == found[1] == found[2]
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e5])
 def test_an_input_in_watts_has_its_part_in_the_target(unit):
     A, B = np.array([[0.95, 0.0], [0.02, 0.9]]), np.array([[0.05, 0.0], [-0.01, 1e-6 * unit]])

@@ -86,6 +86,26 @@ def test_the_report_says_that_inputs_are_logged_a_row_late(late, unit):
     assert said is None or int(said[1]) > 50
 
 
+@pytest.mark.usefixtures("rough_fits")
+@pytest.mark.parametrize("held", [True, False])
+def test_the_report_says_that_a_loop_at_one_set_point_shows_no_effect_of_its_inputs(held):
+    rng, sum_of_errors, x = np.random.default_rng(0), 0.0, 0.0
+    u, y, r = np.zeros(400), np.zeros(401), np.zeros(400)
+    r = r if held else rng.uniform(-3, 3, 20).repeat(20)
+    for k in range(401):
+        y[k] = x + 0.05 * rng.normal()
+        if k < 400:
+            sum_of_errors += 0.05 * (r[k] - y[k])
+            u[k] = 0.5 * (r[k] - y[k]) + sum_of_errors
+            x = 0.9 * x + 0.2 * u[k] + 0.05 * rng.normal()
+    said = re.search(
+        r"explain (\d+)% of the residuals of its y.*add a random",
+        str(qm.identify({"y": y, "u": u}, N)),
+    )
+    assert (said is not None) == held
+    assert said is None or int(said[1]) > 98
+
+
 @pytest.mark.filterwarnings("error")
 def test_single_steps_are_not_said_to_be_late():
     """Their inputs have no outputs of the same row that the model predicts."""

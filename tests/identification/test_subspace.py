@@ -150,6 +150,12 @@ def test_a_likelihood_that_is_no_number_leaves_the_last_model(n_y):
     assert em(broken, data, 3) is broken
 
 
+def test_states_without_finite_squares_leave_the_last_model():
+    A, one = np.diag([2.0, 0.5, 0.4, 0.3]), np.eye(4)
+    start = Noisy(A, one[:, :1], 1e-190 * one, one, one, 1e60 * np.ones(4), one)
+    assert em(start, [Signals(np.zeros((400, 4)), np.ones((399, 1)))], 3) is start
+
+
 def test_smoothed_states_are_the_means_given_the_outputs_that_are_there():
     """States and outputs are one Gaussian vector: its conditional moments are exact."""
     rng, n, n_y, T = np.random.default_rng(0), 3, 2, 250

@@ -236,6 +236,30 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
     assert len(log.notes) == 1 + len(caught)
 
 
+@pytest.mark.parametrize(("rows", "said"), [(2, True), (3, True), (1, False), (30, False)])
+def test_a_few_numbers_that_are_far_from_all_others_are_named(rows, said):
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=200)
+    y[rng.choice(200, rows, replace=False)] = (
+        1e3 * rng.choice([-1, 1], rows) * (2 + np.arange(rows))
+    )
+    log = {"y": y, "u": rng.normal(size=200)}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        qm.read_log(log)
+    named = f"In this log, y is far from all others in {rows} rows, such as "
+    assert [str(x.message)[: len(named)] for x in caught] == [named] * said
+
+
+def test_a_response_that_is_rare_is_no_error():
+    u, y = np.zeros(400), 1e-3 * np.random.default_rng(0).normal(size=401)
+    u[100] = 1.0
+    y[101:115] += 0.8 ** np.arange(14)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        qm.read_log({"y": y, "u": u})
+
+
 @refused(
     (5, {}, "data: got int, expected a CSV file, a DataFrame, a dict of arrays, a list"),
     ([], {}, "data: got an empty list, expected a CSV file"),

@@ -223,9 +223,10 @@ class Steady:
         n, m, _, n_d = plant.sizes
         normal = sizes.plant(plant)
         balance = np.hstack((normal.A - np.eye(n), normal.B))
-        if null_direction(normal.A.T - np.eye(n), normal.B.T) is not None:
-            remedy = "Pass a constant of the model as a known signal, by E."
-            got = "a mode at 1 that no input moves"
+        if (still := null_direction(normal.A.T - np.eye(n), normal.B.T)) is not None:
+            name = plant.outputs[int(np.abs(normal.C @ still).argmax())]
+            remedy = f"Read {name} of a log as known or not at all; pass a model's constant by E."
+            got = f"a mode at 1 that no input moves, as {name} shows"
             raise QPError.expected("model", got, "a model with a steady state", remedy)
         Z = scipy.linalg.null_space(balance, rcond=RANK)
         Z = np.where(np.abs(Z) < RANK, 0.0, Z)  # rounding would let a bound hold by a huge v

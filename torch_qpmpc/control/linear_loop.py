@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import solve_discrete_lyapunov
 
 from torch_qpmpc.control.design import Design, Target
 from torch_qpmpc.control.linear_mpc import LinearMPC
@@ -19,8 +18,9 @@ from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import Tables
 
-#: The number of frequencies, from SLOWEST to alternating samples.
-FREQUENCIES, SLOWEST = 400, 1e-4
+#: The number of frequencies, from SLOWEST to alternating samples, and the one of doublings of the
+#: time after which noise has settled.
+FREQUENCIES, SLOWEST, DOUBLINGS = 400, 1e-4, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,10 @@ class LinearLoop:
         C_c, D_c = np.hstack((K_e @ corrected, K_u)), K_e @ L
         A_c = np.vstack((np.hstack((F @ corrected, np.zeros((len(F), m)))) + G @ C_c, C_c))
         B_c = np.vstack((F @ L + G @ D_c, D_c))
-        R_c = np.vstack((G @ K_r, K_r))
         A = np.block([[plant.A + plant.B @ D_c @ plant.C, plant.B @ C_c], [B_c @ plant.C, A_c]])
         moved = np.hstack((plant.B, plant.B @ D_c, plant.B @ K_r))
-        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, R_c))))
-        parts = (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C)
-        return cls(A, B, *parts, mpc.design.scaling.u)
+        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, np.vstack((G @ K_r, K_r))))))
+        return cls(A, B, (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C), mpc.design.scaling.u)
 
     @property
     def radius(self) -> float:
@@ -76,8 +74,7 @@ class LinearLoop:
         It is inf if the plant or the loop has no steady state.
         """
         (_, _, C_c, D_c), (A, _, C), (L, S) = self.controller, self.plant, noise
-        n_y, n = C.shape
-        m = self.B.shape[1] - 2 * n_y
+        (n_y, n), m = C.shape, self.B.shape[1] - 2 * len(C)
         N, moves = A @ L, (np.zeros((m, n)), np.zeros((m, n_y)))
         of_x, last = C, np.zeros((m, n))
         if active:
@@ -86,7 +83,9 @@ class LinearLoop:
             of_x, last = np.pad(C, ((0, 0), (0, len(A) - n))), np.eye(m, len(A), len(A) - m)
         if not np.abs(np.linalg.eigvals(A)).max() < 1:
             return np.inf
-        X = solve_discrete_lyapunov(A, N @ S @ N.T)
+        X = N @ S @ N.T
+        for _ in range(DOUBLINGS):
+            X, A = X + A @ X @ A.T, A @ A
         changes = moves[0] - last, moves[1]
         parts = (design.Q, of_x, np.eye(n_y)), (design.R, *moves), (design.dR, *changes)
         return float(sum(np.sum(W * (M @ X @ M.T + D @ S @ D.T)) for W, M, D in parts))

@@ -126,10 +126,8 @@ class Identified:
         log, N = self.log, self.horizon
         poles = ", ".join(f"{abs(pole):.3g}" for pole in self.fit.model.poles)
         white = ", ".join(f"{share:.0%}" for share in whiteness(self.model, log.trajectories))
-        orders = [row.order for row in equal_candidates(self.fit.candidates)]
-        equal = ""
-        if len({*orders}) > 1:
-            equal = f"; orders {min(orders)} to {max(orders)} are as good within their error"
+        n = {row.order for row in equal_candidates(self.fit.candidates)} or {0}
+        equal = f"; orders {min(n)} to {max(n)} are as good within their error" * (len(n) > 1)
         lines = [
             str(log),
             f"Model of order {len(self.fit.model.A)} with poles of sizes {poles}{equal}",
@@ -141,6 +139,7 @@ class Identified:
             lines.append(
                 f"The inputs of a row explain {shares.max():.0%} of the residuals of its {output}. "
                 "Unless a controller chose them, they acted before the outputs: move them up a row."
+                " If one did, only the rest shows their effect: near 100%, add a random signal."
             )
         rows = [("RMSE of " + ", ".join(map(log.label, log.outputs)), "R2, cross-validated")]
         longest = min(N, max(part.steps for part in log.trajectories))  # single steps have one
@@ -228,10 +227,7 @@ def check_excitation(log: Log) -> None:
     if log.steps <= needed:
         got = f"{log.steps} transitions in {len(trajectories)} trajectories"
         expected = f"at least {needed + 1} for n_x={n_x}, n_u={n_u} and n_d={n_d}"
-        remedy = (
-            f"A fit of as many transitions as coefficients, {needed}, has no error to judge it by. "
-            "Log more."
-        )
+        remedy = "Log more: the error of as many transitions as coefficients says nothing."
         raise QPError.expected("trajectories", got, expected, remedy)
     u = torch.cat([log.u for log in trajectories])
     if n_u > 1 and ((u == 0) | (u == 1)).all() and (u.sum(-1) == 1).all():
@@ -239,15 +235,13 @@ def check_excitation(log: Log) -> None:
     X = np.concatenate([np.hstack((x.d, continued(x.y.numpy())[:-1], x.u)) for x in trajectories])
     middle, size = X.mean(0), X.std(0)
     X = (X - middle) / np.where(size > 0, size, 1.0)
-    for i in range(n_u):
+    for i, name in enumerate(log.inputs):
         column = X.shape[1] - n_u + i
         if size[column] <= STILL * abs(middle[column]):
-            got = f"{log.inputs[i]} constant at {middle[column]:.6g}"
+            got = f"{name} constant at {middle[column]:.6g}"
             raise QPError.expected("action", got, "one that moves", EXCITE)
         target, others = X[:, column], np.delete(X, column, 1)
         rest = target - others @ np.linalg.lstsq(others, target, rcond=None)[0]
         if np.sqrt((rest**2).mean()) <= STILL:
-            of = "a linear function of the outputs and other actions, as in feedback"
-            raise QPError.expected(
-                "action", f"{log.inputs[i]} {of}", "one that moves by itself", EXCITE
-            )
+            got = f"{name} a linear function of the outputs and other actions, as in feedback"
+            raise QPError.expected("action", got, "one that moves by itself", EXCITE)

@@ -115,7 +115,10 @@ def em(
         if not value - before >= STALLED:
             plain = plain if np.isfinite(value) else last
             break
-        before, last, plain = value, par, _maximise(groups, moments)
+        try:
+            before, last, plain = value, par, _maximise(groups, moments)
+        except np.linalg.LinAlgError:  # the states of an unstable model have no finite squares
+            break
         factor, par = factor * growth, plain
         if factor > 1:
             far = Noisy(*(x + factor * (z - x) for x, z in zip(last, plain, strict=True)))

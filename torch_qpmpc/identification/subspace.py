@@ -163,20 +163,23 @@ def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
 def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of residuals' variance that inputs of the same rows explain, ``(n_y,)``.
 
-    The model predicts an output from the inputs of the rows before: a share above zero is feedback,
+    What the row before and the prediction say of both is taken off: a share above zero is feedback,
     or an input that is logged a row late.
     """
-    n_y, n_u = len(model.C), model.B.shape[1]
-    parts = zip(_errors(model, trajectories, 1), trajectories, strict=True)
-    rows = np.concatenate([np.hstack((e[:-1, 0], one.u[1:])) for e, one in parts])
+    n_y, n_u, parts = len(model.C), model.B.shape[1], []
+    for errors, one in zip(_errors(model, trajectories, 1), trajectories, strict=True):
+        (y, u, _), e = (x.numpy() for x in one), errors[:-1, 0]
+        parts.append(np.hstack((e, u[1:], u[:-1], y[:-2], y[1:-1] - e)))
+    rows = np.concatenate(parts)
     rows = rows[np.isfinite(rows).all(1)]
-    if len(rows) <= n_u + 1:  # such as from trajectories of single steps
+    if (free := len(rows) - rows.shape[1] + n_y - 1) <= 0:  # as of trajectories of single steps
         return np.zeros(n_y)
-    e, u = np.split(rows - rows.mean(0), [n_y], 1)
+    now, past = np.split((rows - rows.mean(0)) / _scale(rows)[1], [n_y + n_u], 1)
+    e, u = np.split(now - past @ np.linalg.lstsq(past, now, rcond=None)[0], [n_y], 1)
     left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
-    before, after = (e**2).sum(0) / (len(rows) - 1), (left**2).sum(0) / (len(rows) - n_u - 1)
+    before, after = (e**2).sum(0) / (free + n_u), (left**2).sum(0) / free
     size = np.nanmax(np.abs(np.concatenate([one.y.numpy() for one in trajectories])), 0)
-    noisy = before > (EXACT * size) ** 2
+    noisy = before > (EXACT * size / _scale(rows)[1][:n_y]) ** 2
     return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
 
 
@@ -321,10 +324,10 @@ def _sums(
 
 def _filtered(model: Innovations, data: Sequence[Signals]) -> list[tuple[Array, Array]]:
     """Return the estimates and the effects of the inputs ``(T + 1, n)`` of each trajectory."""
+    pad = (0, 0), (0, 1), (0, 0)
 
-    def both(y: Array, *known: Array) -> Iterator[tuple[Array, Array]]:
-        effects = np.pad(model.inputs(*known), ((0, 0), (0, 1), (0, 0)))
-        return zip(model.estimates(y, *known), effects, strict=True)
+    def both(y: Array, *v: Array) -> Iterator[tuple[Array, Array]]:
+        return zip(model.estimates(y, *v), np.pad(model.inputs(*v), pad), strict=True)
 
     return _each(model, data, both)
 

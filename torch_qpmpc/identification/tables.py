@@ -19,8 +19,9 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds, shows_times
 from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory
 
-#: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away.
-FAR = 10
+#: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away, and
+#: so are errors: numbers in two rows or more, but at most the share FEW of them.
+FAR, FEW = 10, 0.05
 #: The column of a DataFrame's index of times, and the one of an index in a file, by pandas.
 TIME_INDEX, FILE_INDEX = "the index", "Unnamed: 0"
 #: A column's header with its unit, as in ``T [degC]``.
@@ -163,8 +164,7 @@ def _bare(header: Any) -> str:
 
 def _name_columns(frames: Sequence[pd.DataFrame]) -> tuple[dict[str, str], dict[str, str]]:
     """Name the columns without units where that is clear; return names by header, and units."""
-    headers: dict[str, str] = {}
-    units: dict[str, str] = {}
+    headers, units = dict[str, str](), dict[str, str]()
     for frame in frames:
         bare, names = [_bare(x) for x in frame.columns], []
         for i, (header, name) in enumerate(zip(map(str, frame.columns), bare, strict=True)):
@@ -197,10 +197,7 @@ def _columns(
 
 
 def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, list[str]]:
-    """Return the columns as float64, with NaN for words, and notes on these.
-
-    Text with digits that is no number would be lost, and is refused.
-    """
+    """Return the columns as float64, with NaN for words without digits, and notes on these."""
     values, notes = np.empty((len(frame), len(names))), []
     for i, name in enumerate(names):
         column = _column(frame, name)
@@ -216,8 +213,7 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, lis
             )
             raise QPError.expected("column", got, want, remedy)
         if not np.isfinite(values[:, i]).any():
-            got = f"{name}, without a number"
-            raise QPError.expected("column", got, "a column of numbers")
+            raise QPError.expected("column", f"{name}, without a number", "a column of numbers")
         if len(words):
             rows = _count(len(words), "row")
             notes.append(f"{name} is no number in {rows}, as in {words.iloc[0]!r}")
@@ -250,7 +246,7 @@ def _times(
 
 
 def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Name the columns with a number that repeats and is far from all others, as -9999."""
+    """Name the columns with numbers that are far from all others: one, as -9999, or a few."""
     notes = []
     for name, column in zip(names, values.T, strict=True):
         x, counts = np.unique(column, return_counts=True)
@@ -262,16 +258,20 @@ def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
             "missing numbers: replace them by NaN"
             for end in np.array([0, -1])[far]
         ]
+        away = np.abs(column - np.median(column))
+        last = np.sort(away)[-int(FEW * len(away)) - 1 :]
+        few = np.cumsum((np.diff(last) > 2 * FAR * last[:-1]) & (last[:-1] > 0)).astype(bool).sum()
+        if few > 1 and not far.any():
+            such = f"in {few} rows, such as {column[away.argmax()]:.6g}"
+            notes.append(f"{name} is far from all others {such}: replace errors by NaN")
     return notes
 
 
 def _dependent(values: np.ndarray, names: Sequence[str]) -> list[str]:
     """Name the columns that are constant or a linear function of columns before them."""
-    middle = values.mean(0)
-    X = values - middle
+    X = values - (middle := values.mean(0))
     size = np.sqrt(np.square(X).mean(0))
-    notes: list[str] = []
-    kept: list[int] = []
+    notes, kept = list[str](), list[int]()
     for i, name in enumerate(names):
         if size[i] <= STILL * abs(middle[i]):
             notes.append(f"{name} is constant at {middle[i]:.6g}")
