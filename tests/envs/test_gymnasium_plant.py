@@ -190,6 +190,22 @@ def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(re
     assert batch["next", "reward"].squeeze(-1)[0].tolist() == [-1, -2, -3, -1, -2, -3, -1]
 
 
+@pytest.mark.filterwarnings("ignore:.*The reward returned by", "ignore:The plant ends an episode")
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_reward_in_an_array_is_one_number_or_ends_the_episode(register, count):
+    class Rewarded(Counter):
+        def step(self, action):
+            y, reward, *rest = super().step(action)
+            return y, np.full(count, reward), *rest
+
+    plant = GymnasiumPlant(register(Rewarded))
+    env = plant.vectorised(2, 3, seed=0)
+    rewards = env.rollout(3)["next", "reward"][..., 0]
+    env.close()
+    assert rewards.nan_to_num(9.0).tolist() == [[-1, -2, -3] if count == 1 else [9]] * 2
+    assert len(plant.raised) == 2 * (count - 1)
+
+
 def test_a_terminated_episode_is_terminated(register):
     env = GymnasiumPlant(register(Counter, last=2)).vectorised(1, 3, seed=0)
     batch = env.rollout(4, break_when_any_done=False)

@@ -166,6 +166,8 @@ def test_an_environment_of_other_sizes_is_named():
     message = r"the environment: got outputs and actions of sizes \(3, 1\), .*of sizes \(2, 1\)"
     with pytest.raises(QPError, match=message):
         _ = transformed(pendulum(), KalmanFilter(model(4, 2))).observation_spec
+    with pytest.raises(QPError, match=r"^y: got shape \(3,\), expected shape \(\*batch, 2\)"):
+        transformed(pendulum(), KalmanFilter(model(4, 2))).reset()
 
 
 class Leaky(gymnasium.Env):

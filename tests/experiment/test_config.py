@@ -88,6 +88,11 @@ def test_choices_and_edges_are_accepted(overrides):
     assert Config.of(cfg.model_dump(exclude_unset=True)) == cfg, "as config.yaml keeps it"
 
 
+def test_an_infinite_weight_is_written_as_in_the_files_or_as_hydra_reads_it():
+    settings = (make_config(f"task.state_slack={x}").settings for x in (".inf", "inf"))
+    assert [x["task.state_slack"] for x in settings] == [math.inf] * 2
+
+
 #: Values that a key does not take, and words of the sentence.
 MISTAKES: list[tuple[str, Any, str]] = [
     ("updates", 0, "got 0, but input should be greater than or equal to 1."),

@@ -240,6 +240,7 @@ def test_what_is_no_better_or_stopped_leaves_theta_as_it_was():
     assert moved == [False, True, True]
     assert all(torch.equal(before[name], x) for name, x in mpc.named_parameters())
     assert mpc.on_failure == "raise"
+    assert len(qm.improve(mpc.float(), plant, updates=1, loops=2, steps=5, held_out=16).curve) == 1
 
 
 def test_loops_go_on_where_the_last_window_ended(found):

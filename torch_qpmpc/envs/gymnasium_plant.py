@@ -144,7 +144,8 @@ class _Guarded(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         try:
-            step = self.env.step(action)
+            self._last, reward, *rest = self.env.step(action)
+            reward = np.asarray(reward, float).item()  # from an array of one, too
         except gymnasium.error.Error:  # of how the environment is used
             raise
         except Exception as error:
@@ -154,8 +155,7 @@ class _Guarded(gymnasium.Wrapper):
             if len(self._raised) == 1:
                 warnings.warn(f"The plant ends an episode by {self._raised[0]}.", stacklevel=2)
             return self._last, math.nan, False, True, {}
-        self._last = step[0]
-        return step
+        return self._last, reward, *rest
 
 
 def _applied(space: Any, action: np.ndarray) -> np.ndarray:

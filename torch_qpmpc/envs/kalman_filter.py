@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
+from torch_qpmpc.checks import check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.innovations import Innovations
 
@@ -121,7 +122,7 @@ class KalmanFilter(Transform):
         return x + (K @ error).squeeze(-1), after
 
     def _begun(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        batch = y.shape[:-1]
+        batch = check_tensor("y", y, len(self.C)).shape[:-1]
         memory = self.P0 if self.missing else torch.zeros((), dtype=torch.int64, device=y.device)
         memory = memory.expand(torch.Size([*batch, *memory.shape])).clone()
         return self._corrected(self.x0.expand(*batch, -1), y, memory)

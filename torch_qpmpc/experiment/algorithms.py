@@ -108,12 +108,8 @@ def make_optimizer(cfg: Config, mpc: QPMPC) -> torch.optim.Optimizer:
     """Make the optimiser, with one rate for the cost and one for the constraints."""
     options = cfg.optimizer
     if options.name == "gauss_newton":
-        return GaussNewton(
-            mpc,
-            scales={"cost": 1.0, "constraints": options.scale_constraints},
-            lr=options.lr,
-            damping=options.damping,
-        )
+        scales = {"cost": 1.0, "constraints": options.scale_constraints}
+        return GaussNewton(mpc, scales=scales, lr=options.lr, damping=options.damping)
     rates = {"cost": options.lr_cost, "constraints": options.lr_constraints}
     groups = mpc.parameter_groups(rates)
     if options.name == "adam":

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     PlainValidator,
@@ -51,8 +52,9 @@ Count = Annotated[int, Field(ge=1)]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, le=1)]
-#: Weight of a slack; inf makes the row hard.
-Weight = Annotated[float, Field(ge=0, allow_inf_nan=True)]
+#: Weight of a slack; inf, on a command line .inf as well, makes the row hard.
+OfYaml = BeforeValidator(lambda x: float("inf") if x == ".inf" else x)
+Weight = Annotated[float, Field(ge=0, allow_inf_nan=True), OfYaml]
 Matrix = Annotated[list[list[float]], AfterValidator(_equally_long)]
 
 

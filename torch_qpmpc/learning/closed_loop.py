@@ -568,7 +568,7 @@ class Descent:
             raise QPError.expected("mpc", "one that learns nothing", "learned parts", remedy)
         taken = self._loops.run(mpc, steps)
         seen = torch.cat((taken.known, taken.actions), -1).flatten(0, 1)
-        sizes = seen[seen.isfinite().all(1)].square().mean(0).sqrt()
+        sizes = seen[seen.isfinite().all(1)].square().mean(0).sqrt().to(mpc.C_0)
         x, u, d = sizes[mpc.n_p - mpc.n_x : mpc.n_p], sizes[mpc.n_p :], sizes[: mpc.n_d]
         z = torch.cat((x, u, d))[mpc.layout.signals()]
         rows, after = (mpc.G.detach() * z).norm(dim=-1), x.repeat(mpc.horizon)

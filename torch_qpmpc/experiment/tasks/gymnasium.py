@@ -38,7 +38,7 @@ class GymnasiumSettings(TaskSettings):
     observation_bounds: bool
     id: Annotated[str, AfterValidator(_is_chosen)]
     kwargs: dict[str, Any] | None = None
-    #: The model; null by default, which `given_scheme` accepts with ``start=data`` only.
+    #: The model; null by default, as with ``start=data``, which replaces it.
     A: Matrix | None
     B: Matrix | None
     stage_weight: Matrix | None
