@@ -21,7 +21,10 @@ MOST_DIMENSIONS = 8
 
 
 def _array(name: str, value: Any) -> Array:
-    return read_numbers(name, value).detach().numpy().copy()
+    numbers = read_numbers(name, value).detach().numpy().copy()
+    if not np.isfinite(numbers).all():
+        raise QPError.expected(name, "NaN or inf", "finite entries")
+    return numbers
 
 
 def positive(x: Array, otherwise: Any = 1.0) -> Array:
@@ -59,8 +62,6 @@ class Polytope:
         if A.ndim != 2 or b.shape != A.shape[:1]:
             got = f"shapes {A.shape} and {b.shape}"
             raise QPError.expected("A and b of the polytope", got, "(m, n) and (m,)")
-        if not (np.isfinite(A).all() and np.isfinite(b).all()):
-            raise QPError.expected("A and b of the polytope", "NaN or inf", "finite entries")
         eye = np.eye(A.shape[1])
         upper, lower = (np.array([support(A, b, row) for row in rows]) for rows in (eye, -eye))
         for end in (*upper, *lower):
@@ -76,9 +77,8 @@ class Polytope:
         if lower.ndim != 1 or lower.shape != upper.shape:
             got = f"shapes {lower.shape} and {upper.shape}"
             raise QPError.expected("lower and upper", got, "(n,) each")
-        if not (np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
-            got = f"{lower} and {upper}"
-            raise QPError.expected("lower and upper", got, "finite entries with lower <= upper")
+        if (lower > upper).any():
+            raise QPError.expected("lower and upper", f"{lower} and {upper}", "lower <= upper")
         eye = np.eye(len(lower))
         return cls(np.concatenate((eye, -eye)), np.concatenate((upper, -lower)), lower, upper)
 
@@ -147,7 +147,10 @@ class Plant:
         A, B = _array("A", A), _array("B", B)
         n = len(A)
         offset = np.zeros(n) if offset is None else _array("offset", offset)
-        n_d = 0 if disturbances is None else len(disturbances.lower)
+        n_d = 0
+        if disturbances is not None:
+            check_kind("disturbances", disturbances, Polytope, "Make one with Polytope.box.")
+            n_d = len(disturbances.lower)
         E = (np.eye(n) if n_d == n else np.zeros((n, 0))) if E is None else _array("E", E)
         shapes = A.shape, B.shape[:1], B.ndim, offset.shape, E.shape
         if shapes != ((n, n), (n,), 2, (n,), (n, n_d)):

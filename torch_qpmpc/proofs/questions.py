@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_kind
+from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import check_no_levels
+from torch_qpmpc.mpc.validation import check_no_levels, read_numbers
 from torch_qpmpc.proofs.encoding import encode
 from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, positive
 from torch_qpmpc.proofs.program import Affine, Array, Program
@@ -103,14 +103,15 @@ def largest_violation(
         True
     """
     n = check_states(mpc, states)
-    sides = [np.full(n, np.inf) if x is None else np.array(x, float) for x in (lower, upper)]
-    if any(x.shape != (n,) or np.isnan(x).any() for x in sides):
-        raise QPError.expected("lower and upper", f"{lower} and {upper}", f"({n},) numbers each")
-    A, b = np.concatenate((-np.eye(n), np.eye(n))), np.concatenate((-sides[0], sides[1]))
+    lower = read_numbers("lower", [-np.inf] * n if lower is None else lower).numpy()
+    upper = read_numbers("upper", [np.inf] * n if upper is None else upper).numpy()
+    if not (lower.shape == upper.shape == (n,) and np.minimum(-lower, upper).min() > -np.inf):
+        want = f"({n},) numbers, below inf and above -inf"
+        raise QPError.expected("lower and upper", f"{lower} and {upper}", want)
+    A, b = np.concatenate((-np.eye(n), np.eye(n))), np.concatenate((-lower, upper))
     if not (kept := np.isfinite(b)).any():
         raise QPError.expected("lower and upper", "no finite bound", "at least one")
-    question = f"largest violation in {steps} step{'s' * (steps > 1)}"
-    return _worst(question, mpc, plant, states, A[kept], b[kept], steps, seconds)
+    return _worst("largest violation in", mpc, plant, states, A[kept], b[kept], steps, seconds)
 
 
 def invariance(
@@ -127,10 +128,9 @@ def invariance(
     `largest_violation`.
     """
     check_states(mpc, states)
-    length = np.linalg.norm(states.A, axis=1)
-    question = f"outside the set after {steps} step{'s' * (steps > 1)}"
+    length = positive(np.linalg.norm(states.A, axis=1))
     A, b = states.A / length[:, None], states.b / length
-    return _worst(question, mpc, plant, states, A, b, steps, seconds)
+    return _worst("outside the set after", mpc, plant, states, A, b, steps, seconds)
 
 
 def largest_difference(
@@ -156,7 +156,9 @@ def largest_difference(
         return signs @ (action(first, at) - action(second, at)), at[None], ()
 
     answer = Answer("largest difference of the policies", tables[0].digest, np.full((1, n), np.nan))
-    sizes = np.tile(np.max([_size_of_action(x, states) for x in tables], axis=0), 2)
+    free = [np.abs(x.K) @ states.size + np.abs(x.k) for x in tables]
+    bounds = [np.maximum(np.abs(x.u_lower), np.abs(x.u_upper)) for x in tables]
+    sizes = np.tile(positive(np.minimum(free, bounds).max(0)), 2)
     _maximise(answer, program, rows, sizes, replay, seconds)
     return answer
 
@@ -167,8 +169,7 @@ def check_states(mpc: QPMPC, states: Polytope) -> int:
     check_no_levels(mpc, "proofs")
     check_kind("states", states, Polytope, "Make one with Polytope.box(lower, upper).")
     if len(states.lower) != mpc.n_p:
-        got, want = f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}"
-        raise QPError.expected("states", got, want)
+        raise QPError.expected("states", f"{len(states.lower)} dimensions", f"n_p = {mpc.n_p}")
     return mpc.n_p
 
 
@@ -180,11 +181,6 @@ def _known(program: Program, states: Polytope) -> Affine:
     if not states.is_box():
         program.constrain(p.times(states.A / size[:, None]), upper=states.b / size)
     return p
-
-
-def _size_of_action(tables: Tables, states: Polytope) -> Array:
-    free = np.abs(tables.K) @ states.size + np.abs(tables.k)
-    return positive(np.minimum(free, np.maximum(np.abs(tables.u_lower), np.abs(tables.u_upper))))
 
 
 def action(mpc: QPMPC, p: Array) -> Array:
@@ -205,11 +201,13 @@ def _worst(
 ) -> Answer:
     """Maximise ``max_i A_i p_steps - b_i`` over the set, the disturbances and the plants."""
     plants = check_plants(plant, mpc.n_p, mpc.n_u)
-    if steps < 1 or len(plants) ** steps > MOST_MODELS:
-        got = f"{steps} steps of {len(plants)} plants"
-        raise QPError.expected("steps", got, f"at least one step, and {MOST_MODELS} combinations")
+    check_whole("steps", steps, 1)
+    if len(plants) ** steps > MOST_MODELS:
+        got, want = f"{steps} steps of {len(plants)} plants", f"{MOST_MODELS} combinations"
+        raise QPError.expected("steps", got, want)
     tables, program = make_tables(mpc), Program()
     start = _known(program, states)
+    question += f" {steps} step{'s' * (steps > 1)}"
     answer = Answer(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
     sizes = positive(np.abs(A) @ states.size, positive(np.abs(b)))
     for branch in _branches(program, tables, start, states.vertices(), plants, steps):
@@ -274,8 +272,7 @@ def _maximise(
         if abs(values[i] - maximum.value) > AGREEMENT * (sizes[i] + abs(values[i])):
             raise SolverError(
                 f"The policy gives {values[i]:.6g} where the program says {maximum.value:.6g}: "
-                "the program's tolerances are too wide for this QP. Scale the states to "
-                "numbers of order one, or lower the prices w of soft rows."
+                "its tolerances are too wide for this QP. Lower the prices w of soft rows."
             )
         answer.refuted |= bool((values > TOLERANCE * sizes).any())
         if values.max() > answer.value:
