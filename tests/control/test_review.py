@@ -176,6 +176,20 @@ def test_a_sound_design_has_no_fault(model):
     assert all(x.text[0].isupper() and x.text[-1] == "." for x in found.findings)
 
 
+@pytest.mark.parametrize("moves", [0.01, 1.0])
+def test_a_log_that_shows_an_input_s_effect_less_than_the_noise_is_a_fault(moves):
+    rng, y = np.random.default_rng(2), np.zeros(61)
+    u = moves * rng.choice([-1.0, 1.0], 12).repeat(5)
+    for k in range(60):
+        y[k + 1] = 0.8 * y[k] + u[k]
+    log = qm.read_log({"T": y + 0.2 * rng.normal(size=61), "q": np.append(u, 0.0)}, ["T"], ["q"])
+    mpc = qm.LinearMPC(qm.identify(log, 5, order=1), 10, Q=1.0, dR=0.1, u_bounds=(-1.0, 1.0))
+    found = qm.Controller(mpc).review()["model"]
+    assert found.text.startswith("Errors 5 steps ahead, of the log's deviations: T ")
+    assert found.ok == (moves == 1.0)
+    assert found.ok or found.remedy.startswith("The log does not show how to move T: ")
+
+
 def test_findings_are_about_the_last_known_signals_or_those_passed():
     options = {"E": [[0.1]], "known": ["rain"], "u_bounds": (0.0, 5.0), "y_bounds": (0.0, 50.0)}
     controller = qm.Controller(qm.LinearMPC(LAG, 12, Q=1.0, dR=0.1, **options))

@@ -458,8 +458,7 @@ class Design:
         """The places of all `differences`, in the order of p, ``(2, n_p)``."""
         pairs = [np.stack(np.broadcast_arrays(*pair)) for pair in self.differences.values()]
         stages = [np.broadcast_to(x, (2, self.horizon + 1, x.shape[2])) for x in pairs[:3]]
-        stages = np.concatenate(stages, 2).reshape(2, -1)
-        return np.hstack((stages, *(x[:, 0] for x in pairs[3:])))
+        return np.hstack((np.concatenate(stages, 2).reshape(2, -1), *(x[:, 0] for x in pairs[3:])))
 
     @cached_property
     def acts(self) -> Array:

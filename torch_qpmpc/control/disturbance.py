@@ -166,8 +166,7 @@ def _independent(matrix: Array) -> list[int]:
 
 def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
     """Return the name of a disturbance that cannot be told from an integrator, if any."""
-    n = len(plant.A)
-    shown = np.hstack((plant.C, placed.C))
+    n, shown = len(plant.A), np.hstack((plant.C, placed.C))
     direction = null_direction(np.hstack((plant.A - np.eye(n), placed.B)), shown)
     return None if direction is None else placed.names[int(np.abs(direction[n:]).argmax())]
 
@@ -253,8 +252,7 @@ class Steady:
         for part in maps:  # rounding would set the lengths of the target's QP
             part[np.abs(part) < ROUNDING * np.abs(part).max(0)] = 0.0
         (X, U, Y), (x, u, y) = (np.split(size * part, (n, n + m)) for part in maps)
-        y = y + np.hstack((w.C, np.zeros((len(w.C), n_d + 1))))
-        return cls(X, U, Y, x, u, y, W)
+        return cls(X, U, Y, x, u, y + np.hstack((w.C, np.zeros((len(w.C), n_d + 1)))), W)
 
     @property
     def n_a(self) -> int:

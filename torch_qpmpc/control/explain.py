@@ -55,8 +55,7 @@ class Explanation:
     reach: str
 
     def __str__(self) -> str:
-        plant = self.design.plant
-        lines = [f"{self.status}: {self.status.explanation}"]
+        plant, lines = self.design.plant, [f"{self.status}: {self.status.explanation}"]
         for i, name in enumerate(plant.outputs):
             aim = f", set-point {self.now.r[0, i]:.4g}" * bool(self.design.Q[i].any())
             later = f", in {len(self.y)} steps {self.y[-1, i]:.4g}"

@@ -234,8 +234,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     w = choose(plant, "auto" if old.disturbances.names else None, scaling)
     design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC.of_design(design, **law.mpc.options)
-    drift = law.drift if w.names == old.disturbances.names else None
-    return Law.of(mpc, law.noise, drift)
+    return Law.of(mpc, law.noise, law.drift if w.names == old.disturbances.names else None)
 
 
 def _compare(

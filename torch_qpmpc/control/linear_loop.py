@@ -43,8 +43,7 @@ class LinearLoop:
         """Return the loop of an MPC and an observer, from the tables of the plan and the target."""
         K_e, K_u, K_r = _gains(mpc, plan, target)
         plant, F, G, L = mpc.design.plant, observer.F, observer.G, observer.L
-        m = plant.B.shape[1]
-        corrected = np.eye(len(F)) - L @ observer.H
+        m, corrected = plant.B.shape[1], np.eye(len(F)) - L @ observer.H
         # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
         C_c, D_c = np.hstack((K_e @ corrected, K_u)), K_e @ L
         A_c = np.vstack((np.hstack((F @ corrected, np.zeros((len(F), m)))) + G @ C_c, C_c))

@@ -150,13 +150,11 @@ def riccati(design: Design) -> Array | None:
         Q, S = block_diag(Q, 2 * design.dR), np.vstack((S, -2 * design.dR))
     A, B, W = (torch.as_tensor(x) for x in (A, B, np.block([[Q, S], [S.T, R]])))
     try:
-        P = riccati_weight(A, B, W, design.gamma)
-        K = lqr_gain(A, B, W, design.gamma)
+        P, K = riccati_weight(A, B, W, design.gamma), lqr_gain(A, B, W, design.gamma)
     except (QPError, RuntimeError):  # the latter of a singular matrix
         return None
     radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
-    eigenvalues = torch.linalg.eigvalsh(P)
-    rounding = TINY * W.diagonal().max()
+    eigenvalues, rounding = torch.linalg.eigvalsh(P), TINY * W.diagonal().max()
     exists = radius < 1 - 1e-9 and eigenvalues[0] >= -max(1e-9 * eigenvalues[-1].abs(), rounding)
     P, sizes = P.numpy(), np.concatenate((of_x, of_u))[: len(P)]
     costless = np.diag(P) <= rounding.item()

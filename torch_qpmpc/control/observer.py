@@ -97,16 +97,14 @@ class Observer(NamedTuple):
 
     def corrected(self, P: Array, seen: Array) -> tuple[Array, Array | None]:
         """Return the gain for the outputs that are ``seen`` and the next P, None once steady."""
-        run = self.model.course(seen[None], P)
-        size = np.sqrt(np.diag(self.S))
+        run, size = self.model.course(seen[None], P), np.sqrt(np.diag(self.S))
         off, gain = np.abs(run.K[0] - self.L) * size, np.abs(self.L) * size
         steady = seen.all() and (off.max(1) <= STEADY * gain.max(1)).all()
         return run.K[0], None if steady else run.after
 
     def at_rest(self, u: Array, d: Array, y: Array) -> Array:
         """Return the e that rests with u, d and y."""
-        still = -self.predicted(np.zeros(len(self.F)), u, d)
-        return self.rest @ np.concatenate((still, y))
+        return self.rest @ np.concatenate((-self.predicted(np.zeros(len(self.F)), u, d), y))
 
 
 def kalman(design: Design, noise: Array, drift: Array) -> Observer:
@@ -202,7 +200,5 @@ def max_plausible(design: Design, noise: Array) -> tuple[Array, Array]:
     plant, sizes_u = design.plant, np.maximum(largest(design.u_bounds), design.scaling.u)
     usual, x = np.maximum(sizes_y, noise / SMALL), plant.B * sizes_u
     for _ in range(design.horizon):
-        usual = np.maximum(usual, np.abs(plant.C @ x).max(1))
-        x = plant.A @ x
-    of_d = np.where(plant.E.any(0), ABSURD * design.scaling.d, np.finfo(float).max)
-    return ABSURD * usual, of_d
+        usual, x = np.maximum(usual, np.abs(plant.C @ x).max(1)), plant.A @ x
+    return ABSURD * usual, np.where(plant.E.any(0), ABSURD * design.scaling.d, np.finfo(float).max)

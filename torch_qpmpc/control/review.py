@@ -73,7 +73,7 @@ class Review:
 
 def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review:
     """Return the findings about a controller; see `Controller.review`."""
-    mpc, design, r_last = law.mpc, law.design, memory.r
+    mpc, design, r_last, errors = law.mpc, law.design, memory.r, law.design.plant.errors
     if r is not None:
         rows = 1 if design.references == "held" else design.horizon + 1
         r_last = law.read_set_points(r, rows, memory.r)
@@ -88,6 +88,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     findings = [
         cost,
         terminal,
+        *([_model(design, errors)] if errors is not None and np.isfinite(errors).any() else []),
         *([_free_inputs(design)] if design.free.any() else []),
         *([_known(design)] if design.plant.known else []),
         *([_violation(design)] if design.violation else []),
@@ -151,6 +152,20 @@ def _terminal(design: Design) -> Finding:
         remedy = "Remove the mode from the model, or pass it as a known signal."
     text = text if exists else f"The cost after the horizon is that of its end alone, as {why}."
     return Finding("terminal weight", exists, text, remedy * (not exists))
+
+
+def _model(design: Design, errors: Array) -> Finding:
+    """Predictions of rows that their fit has not seen err by less than the outputs vary."""
+    plant, errors = design.plant, errors[:, np.isfinite(errors).any((0, 2))]
+    moved = plant.C @ plant.visited[1] @ plant.C.T  # pyright: ignore[reportOptionalSubscript]
+    varies = np.sqrt(np.diag(moved + plant.noise[1]))  # pyright: ignore[reportOptionalSubscript]
+    off = np.sqrt(np.nanmean(errors[:, -1] ** 2, 0))
+    pairs = zip(plant.outputs, off, varies, strict=True)
+    each = (f"{plant.quantity(*x)} of {y:.4g}" for *x, y in pairs)
+    text = f"Errors {errors.shape[1]} steps ahead, of the log's deviations: {', '.join(each)}."
+    poor = " and ".join(plant.outputs[i] for i in design.weighted if off[i] > varies[i])
+    remedy = f"The log does not show how to move {poor}: log more rows and larger moves."
+    return Finding("model", not poor, text, remedy * bool(poor))
 
 
 def _free_inputs(design: Design) -> Finding:
@@ -318,8 +333,7 @@ def _reach(setting: Setting) -> Array:
     limits = np.concatenate((upper - rest, rest - lower)) / size
     of_y = bands.arguments == "y_bounds"
     zones = of_y & ~(bands.W[:, :n_y] @ np.diag(design.Q)).astype(bool)
-    hard = ~of_y & np.isinf(bands.price)
-    ends = np.empty((n_y, 2))
+    hard, ends = ~of_y & np.isinf(bands.price), np.empty((n_y, 2))
     for i, side in np.ndindex(n_y, 2):
         sign = 1 - 2 * side
         for kept in (hard | (zones & (bands.W[:, i] == 0)), hard):
@@ -336,8 +350,7 @@ def _reach(setting: Setting) -> Array:
 def _stability(loop: LinearLoop, gamma: float, of_terminal: str) -> Finding:
     """The loop without bounds is stable."""
     slow = np.sort(np.abs(np.linalg.eigvals(loop.A)))[::-1][:3]
-    ok = bool(loop.radius < 1 - 1e-9)
-    listed = ", ".join(f"{x:.4g}" for x in slow)
+    ok, listed = bool(loop.radius < 1 - 1e-9), ", ".join(f"{x:.4g}" for x in slow)
     text = f"Without active bounds, the loop's largest eigenvalues are {listed}."
     remedy = of_terminal or "Lengthen the horizon, or weight more outputs."
     remedy = "Take gamma=1." if gamma < 1 else remedy

@@ -61,8 +61,7 @@ class Run:
         """Return a figure with a panel for each output, input and known signal."""
         from torch_qpmpc.analysis.plots import episode_figure  # imports matplotlib
 
-        plant = self.design.plant
-        known = np.vstack((self.known, self.known[-1:]))
+        plant, known = self.design.plant, np.vstack((self.known, self.known[-1:]))
         times = (plant.dt or 1.0) * np.arange(len(self.y))
         signals = times, self.y, self.u, self.r, *self.design.bounds_at(known)[0]
         times, y, u, r, lower, upper = map(torch.from_numpy, signals)
