@@ -385,3 +385,11 @@ def test_one_episode_alone_chooses_no_start(monkeypatch):
     cfg: Any = SimpleNamespace(task=task, seed=1)
     names = [choosing._compared(cfg, None, start, bar).name for _ in range(100)]  # pyright: ignore
     assert names.count(choosing.LINEAR) <= 15
+    costs = iter(range(10**6))  # of turns: the start's, then those of zero action
+
+    def cheaper(*_: Any, starts: int) -> Any:
+        return SimpleNamespace(costs=10.0 * (next(costs) % 2) + evaluated(starts=starts).costs)
+
+    monkeypatch.setattr(choosing, "evaluate", cheaper)
+    names = [choosing._compared(cfg, None, start, bar).name for _ in range(10)]  # pyright: ignore
+    assert names == [choosing.LINEAR] * 10, "which costs three deviations less"

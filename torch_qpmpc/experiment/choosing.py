@@ -25,17 +25,17 @@ from torch_qpmpc.learning.operators import warm_policy
 #: The seeds of the episodes begin this far above the run's seed, away from an evaluation's.
 APART = 10**6
 #: The probability that a start which is no better than zero action is chosen; and the most episodes
-#: of each, in ``task.start_episodes``.
-ALPHA, MOST = 0.05, 8
+#: of each, in ``task.start_episodes``, or their number: the test needs about 30 at least.
+ALPHA, MOST, LEAST = 0.05, 8, 64
 #: The names of the candidates.
 LINEAR, REGULATOR, NONLINEAR = "linear MPC", "linear MPC, regulator's end", "nonlinear MPC"
 #: The table in a run's folder.
 STARTS = "starts.csv"
 NOTHING = (
-    "No candidate beats zero action, so learning starts from it. Where one costs less here, allow "
-    "more episodes (task.start_episodes). Else pass a log about the states where the controller is "
-    "to work (start.file), one of short episodes if the plant is unstable (task.episode_steps=20), "
-    "or the plant's own cost (task.stage_weight)."
+    "No candidate is shown to beat zero action, so learning starts from it. Where one costs less "
+    "here, allow more episodes (task.start_episodes). Else pass a log about the states where the "
+    "controller is to work (start.file), one of short episodes if the plant is unstable "
+    "(task.episode_steps=20), or the plant's own cost (task.stage_weight)."
 )
 
 
@@ -156,7 +156,7 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         # The episodes of a plant without chance are equal; one alone does not show it.
         equal = len(gain) > 1 and gain.max() - gain.min() <= 1e-9 * gain.abs().mean()
         better = test.decision == "better" or bool(equal)
-        if better or test.decision == "worse" or len(gain) >= MOST * few:
+        if better or test.decision == "worse" or len(gain) >= max(MOST * few, LEAST):
             break
         run(best)
         run(ZERO_ACTION)
