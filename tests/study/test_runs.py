@@ -121,6 +121,16 @@ def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
         qm.load_run(tmp_path)
 
 
+def test_a_run_of_another_version_has_its_policy(gated, tmp_path):
+    shutil.copytree(gated, tmp_path, dirs_exist_ok=True)
+    config = tmp_path / "config.yaml"
+    config.write_text(f"gone: 3\n{config.read_text()}")
+    run, s = qm.load_run(tmp_path), np.ones(4)
+    assert run.predict(s) == pytest.approx(qm.load_run(gated).predict(s))
+    with pytest.raises(QPError, match="gone: got an unknown key"):
+        _ = run.cfg
+
+
 @pytest.fixture
 def acting(tmp_path):
     """Make a run whose policy, with soft bounds, acts on an observer's estimate."""

@@ -30,7 +30,6 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.run_folder import (
     BEST,
-    CHECKPOINT,
     NUMBERS,
     read_config,
     read_metrics,
@@ -129,7 +128,7 @@ class FinishedRun:
     @cached_property
     def policy(self) -> QPMPC:
         """The learned policy, which the run has kept."""
-        return QPMPC.load(self.folder / (BEST if self.cfg.gate else CHECKPOINT))
+        return QPMPC.load(self.folder / BEST)
 
     @property
     def summary(self) -> dict[str, Any]:
