@@ -107,6 +107,13 @@ def test_hard_bounds_of_one_side_leave_slack(bounds):
     assert (np.abs(A @ x + B @ u) - BOX.upper).max() == pytest.approx(answer.bound, abs=1e-5)
 
 
+def test_high_prices_loosen_the_bound_alone():
+    """HiGHS' worst case in another row is not the policy's; the corner's is."""
+    answer = largest_violation(scheme(state_slack=1e5), Plant.of(A, B), BOX, **BOUNDS)
+    assert answer.value == pytest.approx(0.08, abs=1e-6)
+    assert answer.value <= answer.bound + 1e-6
+
+
 def test_the_worst_of_several_plants_counts():
     """From x = (1, 0.5), u = -1 leaves 1.09 with half of B, and 1.08 with B."""
     half, whole, near = Plant.of(A, 0.5 * B), Plant.of(A, B), Polytope.box([0.8, 0.3], BOX.upper)

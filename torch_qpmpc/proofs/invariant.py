@@ -101,7 +101,7 @@ def invariant_set(
         candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre, positive(states.size))
         if candidate and (proof := _proof(mpc, plants, candidate, seconds)) and proof.proved:
             return InvariantSet(candidate, scale, gain, proof)
-    got = "a set without a part that is proved invariant"
+    got = f"a set without a part that is proved invariant about p = {centre}, u = {u}"
     want = "one that the linear law can stay in, with these disturbances, as the policy does"
     remedy = "Allow smaller disturbances, larger states or more seconds."
     raise QPError.expected("states", got, want, remedy)

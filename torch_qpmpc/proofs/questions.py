@@ -21,7 +21,7 @@ from torch_qpmpc.proofs.program import Affine, Array, Program
 
 #: A worst case up to this, relative to the set, counts as zero: HiGHS' tolerance is 1e-6.
 TOLERANCE = 1e-5
-#: A replayed worst case differs from the program's by at most this, relatively.
+#: A replayed worst case exceeds the program's bound by at most this, relatively.
 AGREEMENT = 1e-4
 #: Combinations of models over the steps.
 MOST_MODELS = 64
@@ -269,10 +269,10 @@ def _maximise(
         if not np.isfinite(maximum.value):
             continue
         values, run, noise = replay(maximum.x)
-        if abs(values[i] - maximum.value) > AGREEMENT * (sizes[i] + abs(values[i])):
+        if values[i] > maximum.bound + AGREEMENT * (sizes[i] + abs(values[i])):
             raise SolverError(
-                f"The policy gives {values[i]:.6g} where the program says {maximum.value:.6g}: "
-                "its tolerances are too wide for this QP. Lower the prices w of soft rows."
+                f"The policy gives {values[i]:.6g} where the program says {maximum.bound:.6g} at "
+                "most: its tolerances are too wide for this QP. Lower the prices w of soft rows."
             )
         answer.refuted |= bool((values > TOLERANCE * sizes).any())
         if values.max() > answer.value:
