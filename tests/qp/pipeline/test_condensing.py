@@ -12,6 +12,7 @@ from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.kernels.linalg import particular
 from torch_qpmpc.qp.pipeline.arrays import SoftQPs, Theta, to_tensor
 from torch_qpmpc.qp.pipeline.condensing import (
+    PROXIMAL,
     SHIFT,
     condense,
     dual,
@@ -132,6 +133,15 @@ def test_multipliers_give_the_solution_and_its_rows(r):
         assert_close((-rows[m] @ g - K[m] @ lam) * unit[m], G[m] @ v)
         assert_close(K[m].diagonal(), torch.ones(r).double())
     assert (shift == 0).all()
+
+
+def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
+    G = np.eye(2)[None]
+    H = np.diag([1e4, 0.0])[None]
+    assert dual(H, G).shift == pytest.approx(1e4 * PROXIMAL)
+    searched = dual(H, G, 1e-8)  # not definite up to rounding
+    assert searched.shift == pytest.approx(1e4 * SHIFT)
+    assert dual(H, G, 1e-6).shift == 0
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])

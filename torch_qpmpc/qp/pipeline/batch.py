@@ -133,10 +133,10 @@ class Prepared:
         return sizes(self.condensed(n_f), self.theta, n_f)
 
     @kept
-    def dual(self, n_f: int, least: float = 0.0) -> Dual:
-        """Return the `Dual` of the reduced QPs, with ``least`` added to H's diagonal."""
+    def dual(self, n_f: int, least: float | None = None) -> Dual:
+        """Return the `Dual` of the reduced QPs, see `condensing.dual`."""
         _, _, H, G, *_ = self.reduced(n_f)
-        return dual(H + least * np.eye(H.shape[-1]), G)
+        return dual(H, G, least)
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""

@@ -256,9 +256,10 @@ def _index_of(rows: np.ndarray) -> np.ndarray:
 
 
 @np.errstate(all="ignore")
-def dual(H: np.ndarray, G: np.ndarray) -> Dual:
-    """Return the `Dual` of reduced QPs."""
-    inverse, shift = inverse_factors(H, PROXIMAL, PROXIMAL)
+def dual(H: np.ndarray, G: np.ndarray, least: float | None = None) -> Dual:
+    """Return the `Dual` of reduced QPs, with ``least`` added to H, or made for proximal steps."""
+    shifts = (PROXIMAL, PROXIMAL) if least is None else ()
+    inverse, shift = inverse_factors(H + (least or 0.0) * np.eye(H.shape[-1]), *shifts)
     R = G @ inverse.swapaxes(1, 2)
     unit = np.linalg.norm(R, axis=-1)
     R = R / unit[:, :, None]
