@@ -359,6 +359,6 @@ def test_a_refinement_judges_opposed_rows_alike(length, off, right):
     data = (one, vector(-1.0), one[0, 0], one[:0], none, G, lb, ub, inf, none)
     programs = Programs.of(*data)[0]
     z, lam = np.full((1, 1), 0.5), np.array([[1.0, -0.5]]) / length
-    near = programs.unsolved(Status.NOT_CONVERGED)._replace(z=z, lam=lam)
+    near = programs.unsolved(Status.NOT_CONVERGED)._replace(z=z, lam=lam, active=np.sign(lam))
     refine(programs, near, np.arange(1))
     assert (near.status[0] == Status.SOLVED) == right

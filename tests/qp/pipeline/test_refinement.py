@@ -82,7 +82,7 @@ def test_a_solution_that_ran_along_a_flat_direction_comes_back(held):
     data |= {"G": G * [[1], [np.sign(G[1] @ far)]], "lb": [-inf] * 2, "ub": ub, "w": [inf] * 2}
     parts: Any = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
     p, _ = Programs.of(*QuadraticProgram(**parts).tensors(), torch.zeros(1, 0))
-    ran = p.unsolved(0)._replace(z=(z + far)[None], lam=lam[None])
+    ran = p.unsolved(0)._replace(z=(z + far)[None], lam=lam[None], active=np.sign(lam)[None])
     refine(p, ran, np.arange(1))
     assert ran.value_error.item() < 1e-12
     assert np.abs(ran.z).max() < 10

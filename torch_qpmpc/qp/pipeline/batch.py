@@ -316,9 +316,8 @@ class Programs:
         The warm start of every solver, for the whole batch at once. Codes are those of
         `QPSolution.active`; a set with any other code starts as the empty one.
         """
-        group, fixed, *qps = self.data()
-        rows = active, group, fixed
-        return self._in_threads(active_set.recall, rows, self.prepared.dual(self.n_f), *qps)
+        (group, fixed, *qps), dual = self.data(), self.prepared.dual(self.n_f)
+        return self._in_threads(active_set.recall, (active, group, fixed), dual, *qps)
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -331,9 +330,10 @@ class Programs:
 
     def _in_threads(self, kernel: Callable, rows: Sequence[np.ndarray], *qps: Any) -> BatchSolution:
         """Run a kernel; many QPs of one theta take torch's number of threads."""
-        parts = min(torch.get_num_threads(), len(rows[0]) // MANY) if self.prepared.shared else 1
-        if parts < 2:
+        parts = len(self.group) // MANY
+        if parts < 2 or not self.prepared.shared:
             return BatchSolution(*kernel(*rows, *qps))
+        parts = min(torch.get_num_threads(), parts)
         with ThreadPoolExecutor(parts) as pool:
             split = (np.array_split(x, parts) for x in rows)
             found = pool.map(lambda *part: kernel(*part, *qps), *split)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from torch_qpmpc.qp.kernels import batched
 from torch_qpmpc.qp.kernels import linalg as kernels
 from torch_qpmpc.qp.pipeline.arrays import Array, Theta
 
@@ -292,19 +293,14 @@ def null_space(C: np.ndarray, n_kept: int) -> Elimination:
     """
     (M, n_c, n_z), n_rest = C.shape, C.shape[2] - n_kept
     # In torch, which uses the caller's number of threads.
-    parts = torch.linalg.svd(torch.from_numpy(C[:, :, n_kept:].copy()), full_matrices=True)
-    left, singular, right = (x.numpy() for x in parts)
-    significant = singular > RANK_TOLERANCE * singular.max(-1, keepdims=True, initial=0.0)
-    rank = significant.sum(-1)
-    lowest, k = int(rank.min(initial=n_rest)) if M else 0, singular.shape[-1]
-    inverse = np.where(significant, 1 / np.where(significant, singular, 1.0), 0.0)
-    basis = right.swapaxes(1, 2)
-    pseudo_inverse = (basis[:, :, :k] * inverse[:, None]) @ left[:, :, :k].swapaxes(1, 2)
+    parts = batched.null_space(torch.from_numpy(C[:, :, n_kept:].copy()), RANK_TOLERANCE)
+    inverse, null, rank = (x.numpy() for x in parts)
+    lowest = int(rank.min(initial=n_rest)) if M else 0
     padded = np.arange(lowest, n_rest) < rank[:, None]
     T, Y = np.zeros((M, n_z, n_z - lowest)), np.zeros((M, n_z, n_c))
-    T[:, :n_kept, :n_kept], Y[:, n_kept:] = np.eye(n_kept), pseudo_inverse
-    T[:, n_kept:, :n_kept] = -pseudo_inverse @ C[:, :, :n_kept]
-    T[:, n_kept:, n_kept:] = basis[:, :, lowest:] * ~padded[:, None]
+    T[:, :n_kept, :n_kept], Y[:, n_kept:] = np.eye(n_kept), inverse
+    T[:, n_kept:, :n_kept] = -inverse @ C[:, :, :n_kept]
+    T[:, n_kept:, n_kept:] = null[:, lowest:].swapaxes(1, 2)
     padding = np.concatenate((np.zeros((M, n_kept)), padded), axis=1)
     return Elimination(T, Y, np.zeros((M, 0), np.int64), padding)
 

@@ -72,7 +72,7 @@ def refine(
         return
     for i in which:
         try:
-            refined = _solve(programs.one(i), solution.z[i], solution.lam[i])
+            refined = _solve(programs.one(i), solution.z[i], solution.lam[i], solution.active[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
         if refined is not None:
@@ -82,9 +82,10 @@ def refine(
 
 
 @np.errstate(all="ignore")  # a set without a solution has none that is finite
-def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
-    """Solve from the active set of z and lam; return None if no set does."""
-    codes, slip, x = _first_codes(qp, z, lam), EXACT, None
+def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray, codes: np.ndarray) -> BatchSolution | None:
+    """Solve from z, lam and an active set; return None if no set does."""
+    force, slip, x = np.abs(lam) * np.abs(qp.G).sum(-1), EXACT, None
+    codes = np.where((force <= WEAK * force.max(initial=0.0)) & (qp.lb < qp.ub), 0, codes)
     work = (len(qp.q) + len(qp.b) + np.count_nonzero(codes)) ** 3
     for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
         system = _System.of(qp, codes)
@@ -100,23 +101,6 @@ def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
             return None if solution.status else solution
         codes = np.where(contradiction > 0, states, codes)
     return None
-
-
-def _first_codes(qp: Theta, z: np.ndarray, lam: np.ndarray) -> np.ndarray:
-    """Return codes as in `QPSolution.active`, by the larger of slack and multiplier.
-
-    A row is held if its multiplier is larger than its distance from the bound, and saturated if
-    it is beyond by more than the multiplier is below w, all relatively.
-    """
-    force = np.abs(lam) * np.abs(qp.G).sum(-1)
-    share = force / max(force.max(initial=0.0), TINY)
-    bound, sign = np.where(lam > 0, qp.ub, qp.lb), np.sign(lam)
-    beyond = sign * (qp.G @ z - bound) / np.maximum(_row_sizes(qp, z), TINY)
-    held = (share > np.maximum(np.abs(beyond), WEAK)) | ((qp.lb == qp.ub) & (qp.w > 0))
-    below = 1 - np.abs(lam) / np.maximum(qp.w, TINY)
-    saturated = (qp.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
-    code = np.where(saturated, 2 * sign, np.where(held, np.where(sign == 0, 1, sign), 0))
-    return code.astype(np.int8)
 
 
 def _row_sizes(qp: Theta, z: np.ndarray) -> np.ndarray:
