@@ -1,6 +1,7 @@
 """The start of each script: the paper's point mass or a Gymnasium environment, and a first QP."""
 
 import argparse
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,6 +26,7 @@ class Start(NamedTuple):
 def start(id: str | None, seed: int) -> Start:
     """Make the point mass with a wrong model and a random cost, or ``id`` with a log's."""
     torch.manual_seed(seed)
+    sys.path.append("")  # for MODULE:ID of the current folder
     plant: Any = qm.envs.PointMass() if id is None else qm.envs.GymnasiumPlant(id)
     bounds = plant.lb_a, plant.ub_a
     options: Any = {"action_bounds": bounds, "learn": ("H", "c", "C"), "solver": "daqp"}
