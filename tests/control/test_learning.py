@@ -49,6 +49,15 @@ def logged(steps=600, dt=None):
     return qm.read_log(rows, outputs=["y1"], inputs=["u1"], time=time)
 
 
+def test_a_log_of_the_loop_at_one_set_point_is_refused():
+    controller, r = made(RIGHT), np.random.default_rng(0).uniform(-1, 1, 15).repeat(20)[:, None]
+    runs = [controller.simulate(Lag(noise=0.05), 300, r=x, seed=1) for x in (r, [0.3])]
+    moved, held = ({"y1": x.y[:, 0], "u1": x.u[:, 0]} for x in runs)
+    with pytest.raises(QPError, match=r"log: got inputs .* alone by \d+%, .* Move the set-points"):
+        controller.learn(held, steps=8)
+    assert controller.learn(moved, steps=8).pairs
+
+
 def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
     names = {"inputs": ["q"], "outputs": ["T"], "known": ["price", "sun"], "E": [[0.0, 0.01]]}
     mpc = made(WRONG, linear={"q": "price"}, du_bounds=(-0.5, 0.5), **names).mpc

@@ -34,21 +34,17 @@ from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import STILL, Log, Trajectory, folds
 from torch_qpmpc.identification.reading import as_log
-from torch_qpmpc.learning.closed_loop import (
-    MEMBERS,
-    Improvement,
-    SimulatedPlant,
-    crossed,
-    ensemble,
-)
+from torch_qpmpc.identification.subspace import explained_by_inputs
+from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlant, crossed, ensemble
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.module import QPMPC
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
-#: The least gain, as a share of the old cost, that pairs must show.
-GAIN = 0.01
+#: The least gain, as a share of the old cost, that pairs must show, and the most that inputs may
+#: explain of the residuals of their rows, in feedback, where a model decides.
+GAIN, FED_BACK = 0.01, 0.5
 
 
 class Plant(NamedTuple):
@@ -130,14 +126,18 @@ def learn(
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
-    before, after = np.mean(costs, axis=0)
-    shown = test.decision == "better", float(before), float(after), test.pairs, test.interval
+    means = np.mean(costs, axis=0).tolist()
+    shown = test.decision == "better", *means, test.pairs, test.interval
     return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 
 def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) -> Plant:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
     identified = _identified(held_out, design.plant)
+    if (share := explained_by_inputs(identified.model, held_out.trajectories).max()) > FED_BACK:
+        got = f"inputs in the last third that follow the outputs alone by {share:.0%}"
+        remedy = "Move the set-points, or add a random signal to the inputs."
+        raise QPError.expected("log", got, "some that also move by themselves", remedy)
     d = torch.cat([one.d for one in held_out.trajectories]).numpy()
     middle, size = _set_points(design, held_out, middle, spread)
     noise = np.sqrt(np.diag(identified.fit.model.S))
