@@ -369,6 +369,28 @@ def test_a_table_of_another_log_is_named():
         choose(cfg, physics, collect_log(cfg, physics), choice=other)
 
 
+class Broken(Lag):
+    """Raises in each step, or measures nothing, at a negative ``price``."""
+
+    def reset(self, *, seed=None, options=None):
+        y, info = super().reset(seed=seed)
+        return (y * np.nan if self.price < 0 else y), info
+
+    def step(self, action):
+        raise RuntimeError("no licence")
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("price", [1, -1])
+def test_a_log_without_a_finite_step_is_an_error_with_its_cause(register, price):
+    register(Broken, name="Lag-v0")
+    cause = (
+        r"start: got 400 episodes without a finite step, .* ends them by RuntimeError: no licence"
+    )
+    with pytest.raises(QPError, match=cause):
+        chosen(*DATA, f"task.kwargs={{price: {price}}}")
+
+
 def test_one_episode_alone_chooses_no_start(monkeypatch):
     """Of two policies with costs of one distribution the start is rarely chosen."""
     rng = np.random.default_rng(0)

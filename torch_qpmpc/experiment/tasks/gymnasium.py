@@ -115,8 +115,7 @@ def given_scheme(cfg: Config, plant: GymnasiumPlant) -> Scheme:
         seen = torch.cat((torch.arange(n_y), torch.arange(n_x, n_x + n_u)))
         own, weight = weight, weight.new_zeros(n_x + n_u, n_x + n_u)
         weight[seen[:, None], seen] = own
-    states = torch.full((2, n_x), torch.inf, dtype=torch.float64)
-    states[0] = -states[0]
+    states = torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, n_x)
     if task.observation_bounds:
         states[0, : len(plant.lb_s)], states[1, : len(plant.ub_s)] = plant.lb_s, plant.ub_s
     return plant_scheme(cfg, plant, Model(A, B), weight, (states[0], states[1]))

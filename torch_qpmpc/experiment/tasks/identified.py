@@ -119,6 +119,9 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     `fit_state_space` chooses. That of a `LinearSystem` is measured.
     """
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
+    if cut and not valid_steps(log).any():
+        remedy = "".join(f"The plant ends them by {x}." for x in getattr(physics, "raised", [])[:1])
+        raise QPError.expected("start", f"{cut} episodes without a finite step", "a log", remedy)
     observed = not isinstance(physics, LinearSystem)
     if observed:
         sizes = (physics.n_y, physics.n_d) if isinstance(physics, Plant) else (physics.n_x, 0)
