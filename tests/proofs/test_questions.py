@@ -112,6 +112,10 @@ def test_high_prices_loosen_the_bound_alone():
     answer = largest_violation(scheme(state_slack=1e5), Plant.of(A, B), BOX, **BOUNDS)
     assert answer.value == pytest.approx(0.08, abs=1e-6)
     assert answer.value <= answer.bound + 1e-6
+    with pytest.raises(
+        SolverError, match=r"could miss a worst case: .* Lower the prices w of soft"
+    ):
+        largest_violation(scheme(state_slack=1e8), Plant.of(A, B), BOX, **BOUNDS)
 
 
 def test_the_worst_of_several_plants_counts():

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from scipy.optimize import linprog
 
-from torch_qpmpc.errors import QPError
+from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables
 from torch_qpmpc.proofs.program import Affine, Array, Program
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solve import solve_qp
 
-#: Fraction of the largest possible slack that the plan with slack has in its hard rows.
-SHARE = 0.5
+#: The largest multiplier in units of the rows: one over HiGHS' tolerance of a binary.
+LARGEST = 1e6
 #: Rounds of bound tightening.
 ROUNDS = 2
 #: Margin by which a bound may be exceeded through the solvers' tolerances, relative to its size.
@@ -53,6 +53,7 @@ def encode(program: Program, tables: Tables, p: Affine, vertices: Array) -> Affi
 
     Raises:
         QPError: the QP is infeasible at a vertex, or its hard rows leave no interior there.
+        SolverError: multipliers are too large for HiGHS.
     """
     # HiGHS' tolerances are absolute, so y and lam are in units of the largest y.
     size = np.abs(vertices @ tables.rows.Y.T).max(initial=0.0) or 1.0
@@ -62,6 +63,9 @@ def encode(program: Program, tables: Tables, p: Affine, vertices: Array) -> Affi
     for _ in range(ROUNDS):
         _tighten(program, tables, p, reach)
     lam, _ = _add_rows(program, tables, p, reach)
+    if (most := program.upper[lam.columns].max(initial=0.0)) > LARGEST:
+        text = f"HiGHS could miss a worst case: multipliers reach {most:.1e} times their rows."
+        raise SolverError(f"{text} Lower the prices w of soft rows, or take a smaller set.")
     return (p.times(tables.K) + lam.times(-tables.F)).plus(tables.k)
 
 
@@ -78,10 +82,10 @@ def _derived(tables: Tables, vertices: Array) -> Reach:
     upper = np.where(high > rows.upper, upper, np.inf)
     acts, most = hard & (np.isfinite(lower) | np.isfinite(upper)).any(0), rows.w
     if acts.any():
-        slack = _slack(tables.R[acts], lower[:, acts], upper[:, acts], vertices)
-        slack_of = acts * SHARE * slack[:, None]
+        slack = _slack(tables.R[acts], lower[:, acts], upper[:, acts], vertices) / 2
+        slack_of = acts * slack[:, None]
         cost = _least_cost(tables.R, lower + slack_of, upper - slack_of, rows.w, vertices)
-        most = np.where(hard, cost * (1 + MARGIN) / (SHARE * slack.min()), rows.w)
+        most = np.where(hard, cost * (1 + MARGIN) / slack.min(), rows.w)
     forces = (np.where(np.isfinite(x).any(0), most, 0.0) for x in (upper, lower))
     return Reach(low, high, *forces)
 
@@ -90,7 +94,6 @@ def _least_cost(R: Array, lower: Array, upper: Array, w: Array, vertices: Array)
     """Return the largest ``min |nu|^2 / 2 + sum_i w_i dist(R_i nu, [lower_i, upper_i])``."""
     n, zeros = R.shape[1], torch.zeros(1, dtype=torch.float64)
     rows = [torch.as_tensor(x) for x in (R, lower, upper, w)]
-    # H, q, c, C and b: C has no rows.
     cost = (torch.eye(n).double(), zeros.expand(n), zeros[0], zeros.expand(0, n), zeros[:0])
     qp = QuadraticProgram(*cost, *rows)  # pyright: ignore[reportArgumentType] - nine tensors
     solution = solve_qp(qp, solver="daqp", on_failure="mask")

@@ -103,8 +103,7 @@ class Polytope:
         if self.is_box():
             return np.array(list(itertools.product(*ends)))
         with_radius = np.column_stack((self.A, np.linalg.norm(self.A, axis=1)))
-        bounds = [(None, None)] * n + [(0, None)]
-        inner = linprog([0] * n + [-1], with_radius, self.b, bounds=bounds, method="highs")
+        inner = linprog([0] * n + [-1], with_radius, self.b, bounds=(None, None), method="highs")
         try:
             cut = HalfspaceIntersection(np.column_stack((self.A, -self.b)), inner.x[:n])
         except QhullError as error:

@@ -21,8 +21,6 @@ from torch_qpmpc.proofs.program import Affine, Array, Program
 
 #: A worst case up to this, relative to the set, counts as zero: HiGHS' tolerance is 1e-6.
 TOLERANCE = 1e-5
-#: A replayed worst case exceeds the program's bound by at most this, relatively.
-AGREEMENT = 1e-4
 #: Combinations of models over the steps.
 MOST_MODELS = 64
 
@@ -90,7 +88,7 @@ def largest_violation(
     Raises:
         QPError: an argument is invalid, or the QP has no plan with slack in its hard rows
             somewhere on the way.
-        SolverError: HiGHS gives no bound in time.
+        SolverError: HiGHS gives no bound in time, or prices are too high for it.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -269,7 +267,7 @@ def _maximise(
         if not np.isfinite(maximum.value):
             continue
         values, run, noise = replay(maximum.x)
-        if values[i] > maximum.bound + AGREEMENT * (sizes[i] + abs(values[i])):
+        if values[i] > maximum.bound + 10 * TOLERANCE * (sizes[i] + abs(values[i])):
             raise SolverError(
                 f"The policy gives {values[i]:.6g} where the program says {maximum.bound:.6g} at "
                 "most: its tolerances are too wide for this QP. Lower the prices w of soft rows."
