@@ -146,9 +146,9 @@ def acting(tmp_path):
 
 def test_a_run_s_action_is_within_soft_bounds_and_its_observer_knows_it(acting):
     kalman = qm.envs.KalmanFilter(acting.observer)
-    x, excess = torch.zeros(2), torch.tensor(0.0)
+    x, u, excess = torch.zeros(2), torch.zeros(1), torch.tensor(0.0)
     for k, y in enumerate(torch.tensor([[40.0], [-60.0], [20.0]])):
-        x = kalman.following(x, u, x[:0], y, k) if k else kalman.first(y)  # noqa: F821
+        x = kalman.following(x, u, x[:0], y, k) if k else kalman.first(y)
         wanted = acting.policy.policy(x).detach()
         u = wanted.clamp(-1.0, 0.5)
         excess += (u - wanted).abs().sum()

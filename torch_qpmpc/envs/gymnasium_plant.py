@@ -144,7 +144,7 @@ class _Guarded(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         try:
-            self._last, reward, *rest = self.env.step(action)
+            self._last, reward, terminated, truncated, info = self.env.step(action)
             reward = np.asarray(reward, float).item()  # from an array of one, too
         except gymnasium.error.Error:  # of how the environment is used
             raise
@@ -155,7 +155,7 @@ class _Guarded(gymnasium.Wrapper):
             if len(self._raised) == 1:
                 warnings.warn(f"The plant ends an episode by {self._raised[0]}.", stacklevel=2)
             return self._last, math.nan, False, True, {}
-        return self._last, reward, *rest
+        return self._last, reward, terminated, truncated, info
 
 
 def _applied(space: Any, action: np.ndarray) -> np.ndarray:
