@@ -79,6 +79,27 @@ def test_the_plan_of_blocks_is_that_of_equal_actions(blocks, held):
         assert np.allclose(mpc.predicted(solution.z)[1].detach()[:, 0], u, atol=1e-5)
 
 
+@pytest.mark.parametrize("row", [3, 10], ids=["u_1", "D in stage 1"])
+def test_a_hard_bound_of_one_stage_binds_its_block(row):
+    mpc = QPMPC.of(
+        1,
+        1,
+        4,
+        A=[[1.2]],
+        B=[[1.0]],
+        stage_weight=[1.0, 0.01],
+        action_bounds=([-1.0], [1.0]),
+        constraints=([[0.0, 1.0]], [-2.0], [2.0]),
+        constraint_slack=torch.inf,
+        blocks=[2, 2],
+    )
+    lb = mpc.lb.clone()
+    lb[row] = -0.3
+    mpc.lb = lb
+    u = mpc.predicted(mpc.solve(torch.tensor([9.0])).z)[1].squeeze(-1)
+    assert_close(u, u.new_tensor([-0.3, -0.3, -1.0, -1.0]))
+
+
 def test_gradients_of_blocks_pass_finite_differences():
     mpc = blocked([1, 3])
     names, start = zip(*mpc.named_parameters(), strict=True)

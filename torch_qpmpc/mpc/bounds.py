@@ -220,8 +220,7 @@ def _matching_rows(
         none = torch.zeros(0, dtype=torch.float64)
         return torch.zeros(0, width, dtype=torch.float64), none, none
     if rows[0].shape[1] != width:
-        got = f"D of shape {tuple(rows[0].shape)}"
-        raise QPError.expected(name, got, f"shape (m, {width})")
+        raise QPError.expected(name, f"D of shape {tuple(rows[0].shape)}", f"shape (m, {width})")
     return rows
 
 

@@ -147,9 +147,8 @@ class Levels:
         if failed.any() and on_failure != "mask":
             report(np.where(failed, status, 0), batch, on_failure)
         if (capped := status == Status.NODE_LIMIT).any() and on_failure != "mask":
-            text = (
-                f"{capped.sum()} of {B} plans may not be the best: {Status.NODE_LIMIT.explanation}."
-            )
+            why = Status.NODE_LIMIT.explanation
+            text = f"{capped.sum()} of {B} plans may not be the best: {why}."
             warnings.warn(text, RuntimeWarning, stacklevel=4)
         to = qp.q.device
         lost = torch.from_numpy(failed).reshape(batch).to(to)
@@ -159,9 +158,8 @@ class Levels:
         z = solution.z.clone()
         if self.entries is not None:  # a level to the last bit
             decided = torch.from_numpy(places >= 0).reshape(*batch, *self.rows.shape).to(to)
-            z[..., self.entries] = (
-                best.lb[..., self.rows].to(z).where(decided, z[..., self.entries])
-            )
+            level = best.lb[..., self.rows].to(z)
+            z[..., self.entries] = level.where(decided, z[..., self.entries])
         parts = {name: getattr(solution, name) for name in ("chi", "lam", "xi")}
         parts = {name: torch.where(lost[..., None], 0.0, x) for name, x in parts.items()}
         gap = torch.from_numpy(np.where(capped, gaps, 0.0)).reshape(batch).to(to, qp.q.dtype)

@@ -471,8 +471,12 @@ class QPMPC(nn.Module):
             if self.layout.blocks:
                 rows = self.repetitions.expand(*C.shape[:-2], -1, -1)
                 C, b = torch.cat((C, rows), -2), F.pad(b, (0, rows.shape[-2]))
-                lb = lb.masked_fill(self.repeated, -torch.inf)
-                ub = ub.masked_fill(self.repeated, torch.inf)
+                of_z, again = self.n_z - self.layout.n_preview, self.repeated
+                for side in (lb, ub):  # bounds of a stage's own stay
+                    z, D = side[..., :of_z], side[..., of_z:]
+                    same = z == z.roll(self.layout.n, -1), D.roll(self.layout.n_mixed, -1) == D
+                    again = again & torch.cat(same, -1)
+                lb, ub = lb.masked_fill(again, -torch.inf), ub.masked_fill(again, torch.inf)
             return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
 
     def coordinates(self) -> dict[str, Tensor]:

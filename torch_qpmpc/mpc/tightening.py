@@ -78,7 +78,6 @@ def tighten(
     variance = ((mpc.G @ S) * mpc.G).sum(-1).clamp(min=0)  # of each row's g'z
     margin = float(ndtri(probability)) * variance.sqrt()
     lb, ub = mpc.lb + margin, mpc.ub - margin
-    halfway = (mpc.lb + mpc.ub) / 2
-    crossed = lb > ub
+    halfway, crossed = (mpc.lb + mpc.ub) / 2, lb > ub
     mpc.lb.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, lb), mpc.lb))
     mpc.ub.copy_(torch.where(mpc.soft, torch.where(crossed, halfway, ub), mpc.ub))
