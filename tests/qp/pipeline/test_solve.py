@@ -17,7 +17,7 @@ from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import FEW, AtRest
 from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solution import QPSolution
-from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp
+from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp, interior_point
 
 BATCH = 6
 
@@ -277,8 +277,10 @@ def test_the_active_set_of_an_unsolved_qp_is_unknown():
 
 @pytest.fixture
 def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = doctored(LIES["zeros"])
     for name in list(BACKENDS):
-        monkeypatch.setitem(BACKENDS, name, doctored(LIES["zeros"]))
+        monkeypatch.setitem(BACKENDS, name, nothing)
+    monkeypatch.setattr(interior_point, "solve_arrays", lambda qps, **_: nothing(qps))
     monkeypatch.setattr(refinement, "MAX_SETS", 0)
     lost = lambda self, active: self.unsolved(Status.NOT_CONVERGED)  # noqa: E731
     monkeypatch.setattr(Programs, "recalled", lost)

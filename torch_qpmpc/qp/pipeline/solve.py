@@ -31,7 +31,7 @@ from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, interior_point
-from torch_qpmpc.qp.solvers.interior_point import EARLY
+from torch_qpmpc.qp.solvers.interior_point import EARLY, LAST, MIDDLE, SETTLING
 
 #: Backends that solve again, cold, what the chosen one leaves: they give up soonest, and solve all
 #: that ProxQP solves. The last is the same for each: none decides whether there is a solution.
@@ -381,7 +381,13 @@ def _eliminated(eliminate: Any, programs: Programs, best: BatchSolution) -> Batc
     if prepared.elimination is None or not np.isfinite(prepared.elimination.T).all():
         return best
     other = Programs(prepared, programs.group, programs.fixed)
-    return backed(BACKENDS["torch"], PASSES)(other, best)
+    answer, every = backed(BACKENDS["torch"], PASSES)(other, best), np.arange(len(programs))
+    for target in (EARLY, MIDDLE, LAST):
+        if not answer.status.any():
+            break
+        solve = partial(interior_point.solve_arrays, target=target, steps=SETTLING)
+        answer.improve(every, backed(solve, PASSES)(other, best))
+    return answer
 
 
 def _unconstrained(qps: SoftQPs) -> BackendSolution:

@@ -10,7 +10,8 @@ by side leaves ``(H + G'DG) dv = right`` with the diagonal ``1 / D = s / lam + t
 iteration costs one batched product and one d x d Cholesky factor, used twice. Infinite weights and
 bounds are huge numbers, whose pairs are inert; a hard equality, which has no interior, has a
 penalty and a multiplier of its own. Nothing loops over the batch. From the active set that it
-finds early, `torch_qpmpc.qp.kernels.active_set` goes on.
+finds early, `torch_qpmpc.qp.kernels.active_set` goes on. Where the elimination leaves that too few
+digits, `_settled` solves for the set.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ PENALTY, DAMPING = 1e10, 1e-10
 #: Added to a matrix that is indefinite by rounding, relative to its largest diagonal entry.
 ROUNDING = 1e-12
 #: Gaps, relative to a typical cost, that show an active set, and that end the method.
-EARLY, LAST = 1e-4, 1e-12
-#: The most iterations.
-LIMIT = 65
+EARLY, MIDDLE, LAST = 1e-4, 1e-8, 1e-12
+#: The most iterations; and steps on active sets, with passes of the method of multipliers in each.
+LIMIT, SETTLING, MULTIPLIER_PASSES = 65, 3, 3
 #: Largest step, relative to that to the boundary.
 STEP = 0.995
 #: The initial distance of a side is at least this fraction of the row's width, ..
@@ -154,23 +155,49 @@ class BatchedQPs(NamedTuple):
 
 
 @torch.no_grad()
-def solve(qps: SoftQPs, target: float = LAST) -> BackendSolution:
-    """Solve a batch of tensors on their device.
+def solve(qps: SoftQPs, target: float = LAST, steps: int = 0) -> BackendSolution:
+    """Solve a batch of tensors on their device; take ``steps`` on active sets at the end.
 
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
     form = BatchedQPs.of(qps)
     point = _begin(form)
     _follow(form, point, target)
-    return BackendSolution(point.v, point.lam, point.steps)
+    v, lam = point.v, point.lam
+    for _ in range(steps):
+        v, lam = _settled(form, v, lam)
+    return BackendSolution(v, lam, point.steps)
+
+
+def _settled(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
+    """Return v and lam with active rows at their bounds, and fixed lam in the others.
+
+    The KKT conditions are then linear, and the method of multipliers solves them: a large curvature
+    holds the active rows, even dependent ones, and each pass reduces its error.
+    """
+    y, stiffness = qps.rows(v), qps.force / qps.width
+    p, limit = y + lam / stiffness, qps.w / stiffness
+    nearest = p.clip(qps.lower, qps.upper)
+    excess = p - nearest
+    active = (excess.abs() <= limit) & ((excess != 0) | (qps.lower == qps.upper))
+    lam = torch.where(active, lam, excess.clip(-limit, limit) * stiffness)
+    weight = active * qps.penalty
+    factor = qps.factor(weight)
+    for _ in range(MULTIPLIER_PASSES):
+        short = nearest - y
+        right = qps.apply_Gt(weight * short - lam) - qps.apply_H(v) - qps.g
+        dv = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
+        dy = qps.rows(dv)
+        v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
+    return v, lam
 
 
 def solve_arrays(
-    qps: SoftQPs, device: torch.device | str = "cpu", target: float = LAST
+    qps: SoftQPs, device: torch.device | str = "cpu", target: float = LAST, steps: int = 0
 ) -> BackendSolution:
-    """Solve a batch of arrays on a device."""
+    """Solve a batch of arrays on a device, as `solve`."""
     tensors = SoftQPs._make(torch.from_numpy(x).to(device) for x in qps)
-    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors, target))
+    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors, target, steps))
 
 
 class Point(NamedTuple):
