@@ -3,6 +3,7 @@
 import datetime
 import shutil
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -178,7 +179,7 @@ def test_states_are_drawn_about_a_feasible_one(tmp_path):
 
 
 def test_infeasible_states_are_moved_to_the_edge_of_the_feasible_ones_at_once():
-    moves = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.2, 0.2), "y_bounds": (-1.0, 1.0)}
+    moves: Any = {"u_bounds": (-1.0, 1.0), "du_bounds": (-0.2, 0.2), "y_bounds": (-1.0, 1.0)}
     A, B = [[0.9, 0.3], [-0.2, 0.7]], [[0.4, 0.1], [0.2, 0.5]]
     mpc = qm.LinearMPC((A, B), 5, Q=1.0, dR=0.1, **moves).plan
     tables = make_tables(mpc)

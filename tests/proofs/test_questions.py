@@ -1,6 +1,6 @@
 """Worst cases: against closed forms, samples and the plant itself."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -160,7 +160,7 @@ def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
         (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, None, [-np.inf, 0.0]), "above -"),
         (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, "high"), "lower: got 'high'"),
         (lambda: Plant.of([[np.nan, 0.0], [0.0, 1.0]], B), "A: got NaN or inf"),
-        (lambda: Plant.of(A, B, disturbances=[0.1, 0.1]), "disturbances: got list"),
+        (lambda: Plant.of(A, B, disturbances=cast(Any, [0.1, 0.1])), "disturbances: got list"),
         (
             lambda: largest_violation(scheme(), Plant.of([[1.0]], [[1.0]]), BOX, BOX.lower),
             "plant.B",

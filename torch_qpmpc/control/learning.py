@@ -126,8 +126,8 @@ def learn(
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
-    means = np.mean(costs, axis=0).tolist()
-    shown = test.decision == "better", *means, test.pairs, test.interval
+    before, after = np.mean(costs, axis=0).tolist()
+    shown = test.decision == "better", before, after, test.pairs, test.interval
     return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 

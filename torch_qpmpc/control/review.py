@@ -161,7 +161,7 @@ def _model(design: Design, errors: Array) -> Finding:
     varies = np.sqrt(np.diag(moved + plant.noise[1]))  # pyright: ignore[reportOptionalSubscript]
     off = np.sqrt(np.nanmean(errors[:, -1] ** 2, 0))
     pairs = zip(plant.outputs, off, varies, strict=True)
-    each = (f"{plant.quantity(*x)} of {y:.4g}" for *x, y in pairs)
+    each = (f"{plant.quantity(name, x)} of {y:.4g}" for name, x, y in pairs)
     text = f"Errors {errors.shape[1]} steps ahead, of the log's deviations: {', '.join(each)}."
     poor = " and ".join(plant.outputs[i] for i in design.weighted if off[i] > varies[i])
     remedy = f"The log does not show how to move {poor}: log more rows and larger moves."
