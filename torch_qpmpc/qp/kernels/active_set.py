@@ -31,8 +31,8 @@ DEPENDENT, NOISE = 1e-11, 1e-9
 FEASIBLE = 1e-8
 #: Proximal steps, of a singular H.
 PROXIMAL_STEPS = 4
-#: The most changes of the active set.
-MAX_STEPS = 2000
+#: The most changes of the active set; and the QPs before, one of which is similar.
+MAX_STEPS, NEAR = 2000, 256
 
 
 @partial(compiled, nogil=True)
@@ -49,20 +49,25 @@ def recall(active, group, fixed, dual, theta, reduced, sizes):
     v, lam, steps = g, np.zeros((B, r)), np.ones(B, np.int64)
     low, high, weight, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
     sides, held, factor = np.zeros((B, r), np.int64), np.empty(r, np.int64), np.empty((r, r))
-    for i in range(B):
-        for j in range(r):
-            sides[i, j] = active[i, reduced.rows[j]]
-        if r and np.abs(sides[i]).max() > 2:  # unknown
-            sides[i] = 0
-    for _ in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 1):
+    for step in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 1):
         v, free = -products(dual.inverse, group, g, spans), -products(dual.rows, group, g, spans)
         for i in range(B):
             K, unit, i_w, side = dual.K[group[i]], dual.unit[group[i]], i % len(w), sides[i]
+            passes = 2
             for j in range(r):
                 low[j], high[j] = g_l_u[i, d + j] / unit[j], g_l_u[i, d + r + j] / unit[j]
                 weight[j] = w[i_w, j] * unit[j]
+                side[j] = side[j] if step else active[i, reduced.rows[j]]
+            if r and step == 0 and np.abs(side).max() > 2:  # unknown
+                side[:], nearest, passes = 0, np.inf, 1
+                for k in range(max(0, i - NEAR), i):
+                    distance = 0.0
+                    for j in range(fixed.shape[1]):
+                        distance += (fixed[i, j] - fixed[k, j]) ** 2
+                    if distance < nearest and group[k] == group[i]:
+                        side[:], nearest = sides[k], distance
             # Once more from the last set: of one set, the solution is that whatever led to it.
-            for _ in range(2):
+            for _ in range(passes):
                 n = _begin(K, low, high, weight, lam[i], side, held, factor, x)
                 n, _, changes = solve(
                     K, free[i], low, high, weight, lam[i], y, side, held, n, factor, x, np.inf

@@ -314,7 +314,7 @@ class Programs:
         """Solve the QPs from active sets ``(B, n_g)``, corrected where needed, and certify them.
 
         The warm start of every solver, for the whole batch at once. Codes are those of
-        `QPSolution.active`; a set with any other code starts as the empty one.
+        `QPSolution.active`; a set with any other code starts as one of a similar QP before.
         """
         (group, fixed, *qps), dual = self.data(), self.prepared.dual(self.n_f)
         return self._in_threads(active_set.recall, (active, group, fixed), dual, *qps)

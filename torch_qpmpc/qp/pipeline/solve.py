@@ -332,7 +332,7 @@ def _early(device: torch.device | None, programs: Programs, best: BatchSolution)
 
 
 def _recalled(programs: Programs, best: BatchSolution | None) -> BatchSolution:
-    """Solve from the candidates' active sets, or from empty ones."""
+    """Solve from the candidates' active sets, or from those of similar QPs."""
     return programs.recalled((best or programs.unsolved(Status.NOT_CONVERGED)).active)
 
 
