@@ -23,7 +23,7 @@ def test_a_case_is_a_row_with_median_interval_and_both_ends():
 def test_a_loop_that_is_unstable_with_the_true_plant_is_said_to_be():
     frame = made_up({("gaussian", "free"): [0.9] * 3})
     frame.loc[1, "radius"] = 1.217
-    assert "(2 of 3); 1 unstable, radius 1.217 |" in report.cases_table(frame)
+    assert "(2 of 3); 1 unstable: 1.217 |" in report.cases_table(frame)
 
 
 def test_fewer_than_six_runs_have_a_range():

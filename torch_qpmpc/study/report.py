@@ -31,8 +31,8 @@ SIDE_BY_SIDE = 8
 CAPTION = f"""\
 Closed gap: median and 95% interval (bootstrapped over seeds; the range of fewer than six) of the
 runs with a real gap, J_start - J_true_model >= {REAL_GAP:g} J_start, and their number; unstable are
-runs whose loop with the true plant has a spectral radius above 1 at the origin. All other entries
-are medians over all runs.
+runs whose loop with the true plant has a spectral radius above 1 at the origin, the largest of
+which follows. All other entries are medians over all runs.
 J: start to learned, with the true model in brackets. Distance: relative distance of C's predictions
 from those of the nearest time-invariant MPC scheme. Zeros: share of C's entries above the band that
 are exactly zero. Prediction error: root mean square over one step, of the corrupted (A, B) and of
@@ -46,7 +46,7 @@ def cases_table(sweep: pd.DataFrame) -> str:
         real = runs.query("real")["closed_gap"].to_numpy()
         gap = f"{np.median(real):.3f} {spread([real]).text()}" if len(real) else "-"
         loose = runs.query("radius > 1")["radius"]
-        shown = f"; {len(loose)} unstable, radius {loose.max():.3f}" if len(loose) else ""
+        shown = f"; {len(loose)} unstable: {loose.max():.3f}" if len(loose) else ""
         median: Any = runs.median(numeric_only=True)
         start, best, true = (cost_text(median[f"J_{x}"]) for x in ("start", "best", "true_model"))
         errors = f"{median['prediction_error_start']:.3f} to {median['prediction_error']:.3f}"
