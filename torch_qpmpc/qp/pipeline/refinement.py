@@ -72,7 +72,7 @@ def refine(
         return
     for i in which:
         try:
-            refined = _solve(programs.one(i), solution.z[i], solution.lam[i], solution.active[i])
+            refined = _solve(programs.one(i), solution.z[i], solution.lam[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
         if refined is not None:
@@ -82,10 +82,14 @@ def refine(
 
 
 @np.errstate(all="ignore")  # a set without a solution has none that is finite
-def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray, codes: np.ndarray) -> BatchSolution | None:
-    """Solve from z, lam and an active set; return None if no set does."""
-    force, slip, x = np.abs(lam) * np.abs(qp.G).sum(-1), EXACT, None
-    codes = np.where((force <= WEAK * force.max(initial=0.0)) & (qp.lb < qp.ub), 0, codes)
+def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
+    """Solve from the rows whose multiplier is larger than their slack; None if no set does."""
+    force, sign, slip, x = np.abs(lam) * np.abs(qp.G).sum(-1), np.sign(lam), EXACT, None
+    share, below = force / max(force.max(initial=0.0), TINY), 1 - np.abs(lam) / (qp.w + TINY)
+    beyond = sign * (qp.G @ z - np.where(lam > 0, qp.ub, qp.lb)) / (_row_sizes(qp, z) + TINY)
+    held = (share > np.maximum(np.abs(beyond), WEAK)) | ((qp.lb == qp.ub) & (qp.w > 0))
+    saturated = (qp.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
+    codes = np.where(saturated, 2 * sign, held * np.where(sign == 0, 1, sign)).astype(np.int8)
     work = (len(qp.q) + len(qp.b) + np.count_nonzero(codes)) ** 3
     for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
         system = _System.of(qp, codes)
