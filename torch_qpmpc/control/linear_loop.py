@@ -18,8 +18,7 @@ from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import Tables
 
-#: The number of frequencies, from SLOWEST to alternating samples, and the one of doublings of the
-#: time after which noise has settled.
+#: Frequencies, from SLOWEST to alternating samples; doublings of the time until noise settles.
 FREQUENCIES, SLOWEST, DOUBLINGS = 400, 1e-4, 50
 
 
@@ -50,7 +49,8 @@ class LinearLoop:
         B_c = np.vstack((F @ L + G @ D_c, D_c))
         A = np.block([[plant.A + plant.B @ D_c @ plant.C, plant.B @ C_c], [B_c @ plant.C, A_c]])
         moved = np.hstack((plant.B, plant.B @ D_c, plant.B @ K_r))
-        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, np.vstack((G @ K_r, K_r))))))
+        R_c = np.vstack((G @ K_r, K_r))
+        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, R_c))))
         return cls(A, B, (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C), mpc.design.scaling.u)
 
     @property

@@ -174,12 +174,12 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
     rows = rows[np.isfinite(rows).all(1)]
     if (free := len(rows) - rows.shape[1] + n_y - 1) <= 0:  # as of trajectories of single steps
         return np.zeros(n_y)
-    now, past = np.split((rows - rows.mean(0)) / _scale(rows)[1], [n_y + n_u], 1)
+    (mean, unit), every = _scale(rows), np.concatenate([one.y.numpy() for one in trajectories])
+    now, past = np.split((rows - mean) / unit, [n_y + n_u], 1)
     e, u = np.split(now - past @ np.linalg.lstsq(past, now, rcond=None)[0], [n_y], 1)
     left = e - u @ np.linalg.lstsq(u, e, rcond=None)[0]
     before, after = (e**2).sum(0) / (free + n_u), (left**2).sum(0) / free
-    size = np.nanmax(np.abs(np.concatenate([one.y.numpy() for one in trajectories])), 0)
-    noisy = before > (EXACT * size / _scale(rows)[1][:n_y]) ** 2
+    noisy = before > (EXACT * np.nanmax(np.abs(every), 0) / unit[:n_y]) ** 2
     return np.where(noisy, 1 - after / np.where(noisy, before, 1.0), 0.0)
 
 
