@@ -3,16 +3,26 @@
 This is the only file that imports ProxSuite. Its handles are local to a call: a copied or pickled
 handle crashes the process, so none may reach a module, and a new one makes the result independent
 of earlier solves.
+
+The split-slack form has soft rows as linear ones, for solvers with hard constraints only:
+
+    min over v, t+, t-:   1/2 v'Hv + g'v + w'(t+ + t-)
+    subject to            l <= G v - t+ + t- <= u,   0 <= t+, t-
+
+There is one slack per side instead of the paper's one sigma per row: the optimum is the same, and
+ProxQP needs half the iterations and reports no false infeasibility. Hard rows have no slack.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import scipy  # imports scipy.sparse at its first use
 import torch
 from proxsuite import proxqp
 
 from torch_qpmpc.qp.pipeline.arrays import BackendSolution, SoftQPs
-from torch_qpmpc.qp.solvers.qpsolvers import SplitSlack
 
 EPS_ABS = 1e-9
 #: ProxQP's default, 1e-4, calls one soft (always feasible) QP in fifty infeasible.
@@ -22,6 +32,48 @@ EPS_INFEASIBLE = 1e-12
 MAX_ITER, MAX_ITER_IN = 30, 100
 #: The default, 10, takes a tenth of the time and saves no iteration.
 REFINEMENTS = 2
+
+
+@dataclass(frozen=True)
+class SplitSlack:
+    """Matrices shared by a batch: x = (v, t+, t-), rows (G v - t+ + t-, t+, t-)."""
+
+    n_v: int
+    n_rows: int
+    soft: np.ndarray  # rows that have slacks
+    H: list[scipy.sparse.csc_matrix]
+    rows: list[scipy.sparse.csc_matrix]
+
+    @classmethod
+    def of(cls, qps: SoftQPs) -> SplitSlack:
+        (n_rows, n_v), sp = qps.G.shape[1:], scipy.sparse
+        soft = np.flatnonzero(np.isfinite(qps.w).any(axis=0))
+        n_t, unit = 2 * len(soft), sp.csc_matrix(np.eye(n_rows))[:, soft]
+        slack = sp.hstack([-unit, unit])
+        positive = sp.hstack([sp.csc_matrix((n_t, n_v)), sp.identity(n_t)])
+        blank = sp.csc_matrix((n_t, n_t))
+        return cls(
+            n_v,
+            n_rows,
+            soft,
+            [sp.csc_matrix(sp.block_diag([H, blank])) for H in qps.H],
+            [sp.csc_matrix(sp.vstack([sp.hstack([G, slack]), positive])) for G in qps.G],
+        )
+
+    def gradient(self, g: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return the linear cost of x for one QP; a hard row's slack is fixed at zero."""
+        weight = np.where(np.isfinite(w), w, 0.0)[self.soft]
+        return np.concatenate([g, weight, weight])
+
+    def bounds(
+        self, lower: np.ndarray, upper: np.ndarray, w: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of the rows for one QP."""
+        slack_upper = np.tile(np.where(np.isfinite(w), np.inf, 0.0)[self.soft], 2)
+        return (
+            np.concatenate([lower, np.zeros_like(slack_upper)]),
+            np.concatenate([upper, slack_upper]),
+        )
 
 
 def solve(qps: SoftQPs) -> BackendSolution:
