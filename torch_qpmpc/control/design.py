@@ -13,10 +13,10 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
 from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
-from torch_qpmpc.control.scaling import Bounds, Scaling, ranges
+from torch_qpmpc.control.scaling import Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.levels import DEFAULTS, check_used, read_levels
+from torch_qpmpc.mpc.levels import DEFAULTS, check_used, hull, read_levels
 from torch_qpmpc.mpc.scheme import check_keywords
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
@@ -118,8 +118,7 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-        bounds = within_levels(self.u_bounds, self.levels, self.plant, self.du_bounds)
-        object.__setattr__(self, "u_bounds", bounds)
+        self._check_levels()
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
         if (self.y_bounds[0] + self.margins[0] > self.y_bounds[1] - self.margins[1]).any():
@@ -138,6 +137,18 @@ class Design:
         parts = [f"{y} by {u}", *([f"known {d}"] if d else []), f"horizon {self.horizon}"]
         parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
         return "; ".join(parts)
+
+    def _check_levels(self) -> None:
+        """Take the bounds of inputs to their levels, and check that moves reach the next ones."""
+        inputs, levels = self.plant.inputs, [*map(self.levels.get, self.plant.inputs)]
+        bounds = hull("u_bounds", self.u_bounds, levels, inputs)
+        object.__setattr__(self, "u_bounds", bounds)
+        for name, own, *ends in zip(inputs, levels, *bounds, *self.du_bounds, strict=True):
+            lower, upper, down, up = ends
+            gap = np.diff([x for x in own or () if lower <= x <= upper]).max(initial=0.0)
+            if not down <= -gap <= gap <= up:
+                got = f"[{down:g}, {up:g}] of {name}"
+                raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
 
     def merged(self, name: str, changes: Mapping[str, Any], names: Sequence[str]) -> Any:
         """Return an argument of `LinearMPC` as it is, but for those ``names`` in ``changes``.
@@ -548,28 +559,6 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
             limits = {key: pair for key, pair in limits.items() if key not in names} | own
     read = {k: readers[k][0](k, value, readers[k][1]) for k, value in wishes.items()}
     return read | {"limits": limits}
-
-
-def within_levels(bounds: Bounds, levels: Any, plant: StateSpace, moves: Bounds) -> Bounds:
-    """Return bounds of the inputs within their levels.
-
-    Raises:
-        QPError: no level of an input is within its bounds, or no move reaches the next one.
-    """
-    lower, upper = (side.copy() for side in bounds)
-    for name, own in levels.items():
-        a = plant.inputs.index(name)
-        kept = [x for x in own if lower[a] <= x <= upper[a]]
-        if not kept:
-            got = f"[{lower[a]:g}, {upper[a]:g}] of {name}"
-            want = f"bounds with one of its levels {', '.join(f'{x:g}' for x in own)}"
-            raise QPError.expected("u_bounds", got, want)
-        gap, (down, up) = np.diff(kept).max(initial=0.0), (side[a] for side in moves)
-        if not down <= -gap <= gap <= up:
-            got = f"[{down:g}, {up:g}] of {name}"
-            raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
-        lower[a], upper[a] = kept[0], kept[-1]
-    return lower, upper
 
 
 def read_switching(

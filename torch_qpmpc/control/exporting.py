@@ -312,13 +312,17 @@ def _sizes(law: Law) -> dict[str, int]:
     sizes |= {"N_F": design.steady.anchors, "ROUNDS": ROUNDS}
     sizes |= {"SET_POINTS": stages if design.references == "preview" else 1}
     sizes |= {"WEIGHTED": len(design.weighted), "PULLS": int(design.pulls[1].size > 0)}
-    sizes |= {"LEVELS": law.levels.shape[1], "RUNS": max(levels.rules.sum(1)) if levels else 0}
+    sizes |= {"LEVELS": levels.values.shape[1] if levels else 0}
+    sizes |= {"RUNS": max(levels.rules.sum(1)) if levels else 0}
     return sizes | {key: width[name] for key, name in of.items()}
 
 
 def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
     """Return the constant arrays by their names in C; ``missing`` outputs take more of them."""
     design, steady, observer = law.design, law.design.steady, law.observer
+    if levels := law.mpc.plan.levels:
+        on_levels = np.full((len(design.R), levels.values.shape[1]), np.inf)
+        on_levels[levels.actions] = levels.values
     own = observer._asdict() | {"gains": observer.gains.reshape(len(observer.gains), -1)}
     S, first, LS = own.pop("S"), own.pop("P"), observer.L @ observer.S
     if missing:
@@ -339,7 +343,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         "MOST_U": law.max_plausible_u,
         "SHRINKS": np.array([SHRINKS]),
         "STAYS": np.array([max(STAYS, 100 * np.finfo(dtype).eps)]),
-        **({"INPUT_LEVELS": law.levels, "SWITCH": law.switches} if design.levels else {}),
+        **({"INPUT_LEVELS": on_levels, "SWITCH": law.switches} if levels else {}),
     }
 
 

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
-from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,7 +50,7 @@ class Memory(NamedTuple):
         r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         runs: for how many steps each input was on (above its lowest level), or with a minus off;
-            None in files without levels.
+            None without levels.
         ahead: the levels that the last plan has from the next step on, None without any.
         rest: the outputs and the input at rest that the last reset was passed, or None for each.
         P: the observer's P for the next step after a missing output, None while it is steady.
@@ -223,7 +222,7 @@ class Law:
             status = Outcome.INFEASIBLE if found == Status.INFEASIBLE else Outcome.LIMIT
             return law._held(memory, e, status)
         u_s, moved = target.u[-1] if design.staged else target.u, plan.z[0, len(p) :]
-        u = self._on_level(self._within(u_s + moved[: len(u_s)], memory), memory)
+        u = self._within(u_s + moved[: len(u_s)], memory, on_levels=True)
         memory = self._after(memory, e, u, ahead)
         return Move(u, memory, Outcome.NODE_LIMIT if found else status, law, target, p, plan)
 
@@ -308,36 +307,22 @@ class Law:
         levels = (self.design.levels.get(name, ()) for name in self.design.plant.inputs)
         return np.array([np.mean(own[:2]) if own else np.inf for own in levels])
 
-    @cached_property
-    def levels(self) -> Array:
-        """The levels of inputs within their bounds, ``(m, L)``, and inf behind them."""
-        of = [self.design.levels.get(name, ()) for name in self.design.plant.inputs]
-        own = np.array([*zip_longest(*of, fillvalue=np.inf)]).T.reshape(len(of), -1)
-        lower, upper = (side[:, None] for side in self.design.u_bounds)
-        return np.sort(np.where((lower <= own) & (own <= upper), own, np.inf))
-
     def check_runs(self, memory: Memory) -> None:
         """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
-        runs = [] if memory.runs is None else memory.runs
-        for i, (name, run) in enumerate(zip(self.design.plant.inputs, runs, strict=False)):
-            word, levels = "on" if run > 0 else "off", self.levels[i, np.isfinite(self.levels[i])]
-            left = self.design.switching[f"min_{word}"][i] - abs(run) if len(levels) else 0
-            if left > 0 and not ((levels > self.switches[i]) == (run > 0)).any():
+        lower, upper = self.design.u_bounds
+        for name, own in self.design.levels.items():
+            i = self.design.plant.inputs.index(name)
+            on, levels = memory.runs[i] > 0, [x for x in own if lower[i] <= x <= upper[i]]
+            rule = "min_on" if on else "min_off"
+            left = self.design.switching[rule][i] - abs(memory.runs[i])
+            if left > 0 and all((x > self.switches[i]) != on for x in levels):
                 got = f"levels {', '.join(f'{x:g}' for x in levels)} of {name}"
-                want = f"one that is {word} for {left:g} more steps, by min_{word}"
+                want = f"one that is {rule[4:]} for {left:g} more steps, by {rule}"
                 raise QPError.expected("u_bounds", got, want, "Change them then.")
-
-    def _on_level(self, u: Array, memory: Memory) -> Array:
-        """Return inputs at their nearest levels within their bounds now."""
-        if not self.design.levels:
-            return u
-        inside = self.levels == self._within(self.levels.T, memory).T
-        off = np.where(inside, np.abs(self.levels - u[:, None]), np.inf)
-        return np.where(off.min(1) < np.inf, self.levels[np.arange(len(u)), off.argmin(1)], u)
 
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
-        u = self._on_level(self._within(memory.u, memory), memory)
+        u = self._within(memory.u, memory, on_levels=True)
         return Move(u, self._after(memory, e, u), status, self)
 
     def _target(self, r: Array, known: Array, w: Array) -> Target:
@@ -415,11 +400,9 @@ class Law:
         if e is not None:
             assert memory.known is not None
             e = self.predicted(e, u, memory.known)
-        runs = memory.runs
-        if self.design.levels:
-            on, runs = u > self.switches, np.zeros(len(u)) if runs is None else runs
+        if (runs := memory.runs) is not None:
+            on = u > self.switches
             runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
-            runs = np.clip(runs, -LONG, LONG).astype(np.int64)
         return memory._replace(u=u, e=e, runs=runs, ahead=ahead)
 
     def predicted(self, e: Array, u: Array, d: Array) -> Array:
@@ -438,12 +421,17 @@ class Law:
             e = self.at(e, u, d).observer.at_rest(u, d, y)
         return e
 
-    def _within(self, u: Array, memory: Memory) -> Array:
-        """Return inputs within their bounds, as known signals have them now."""
+    def _within(self, u: Array, memory: Memory, on_levels: bool = False) -> Array:
+        """Return inputs within their bounds, as known signals have them now, or on levels there."""
         lower, upper = self.design.u_bounds
         if memory.known is not None and self.design.limits:
             lower, upper = self.design.bounds_at(memory.known)[1]
-        return np.minimum(np.maximum(u, lower), upper)
+        u = np.minimum(np.maximum(u, lower), upper)
+        for name, own in self.design.levels.items() if on_levels else ():
+            i = self.design.plant.inputs.index(name)
+            inside = np.array([x for x in own if lower[i] <= x <= upper[i]])
+            u[i] = inside[np.abs(inside - u[i]).argmin()] if len(inside) else u[i]
+        return u
 
     def policy(self, memory: Memory) -> Callable[[Signals], Move]:
         """Return `step` as a function that keeps its own memory."""

@@ -63,14 +63,9 @@ class Agreement:
 
 
 @torch.no_grad()
-def programs(mpc: QPMPC, p: Array, z: Array | None = None) -> Programs:
-    """Return V's QPs at p ``(B, n_p)``, with actions on levels as they are in z, if it is given."""
-    qp = mpc.quadratic_program()
-    if mpc.levels is not None and z is not None:
-        y = (torch.as_tensor(z) @ qp.G.mT)[:, mpc.levels.rows, None].numpy()
-        off = np.abs(y - mpc.levels.values[:, None])
-        qp = mpc.levels.held(qp, off.argmin(-1), p.shape[:1])
-    return Programs.of(*qp.tensors(), torch.as_tensor(p))[0]
+def programs(mpc: QPMPC, p: Array) -> Programs:
+    """Return V's QPs at p ``(B, n_p)``, with actions between their levels."""
+    return Programs.of(*mpc.quadratic_program().tensors(), torch.as_tensor(p))[0]
 
 
 def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> BatchSolution:
@@ -96,13 +91,18 @@ def _is_large(qps: Programs) -> bool:
 
 
 def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
-    """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose."""
-    qps, exact = programs(mpc, p, coarse.z), coarse.at(np.arange(len(p)))
-    if len(loose := which[exact.value_error[which] > DOUBTFUL]) and mpc.levels is None:
+    """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose.
+
+    Those of actions on levels, whose QPs differ from state to state, stay.
+    """
+    qps, exact = programs(mpc, p), coarse.at(np.arange(len(p)))
+    if mpc.levels is not None:
+        return exact
+    if len(loose := which[exact.value_error[which] > DOUBTFUL]):
         exact.put(loose, reference(mpc, p[loose], "torch"))
     if len(which) and not _is_large(qps):
         refine(qps, exact, which, last=True)
-    return exact if mpc.levels is None else exact._replace(value=coarse.value)  # has starts
+    return exact
 
 
 def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution]:

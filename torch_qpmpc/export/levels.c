@@ -3,50 +3,39 @@
 
 enum { DECIDED = POLICY_DECIDED, DECISIONS = POLICY_LEVELS * DECIDED };
 
-/* Return the state of an action after a step on or off, -1 if that is not left to it. The states are
-   1, .., least[0] steps off, then 1, .., least[1] steps on, the last of each or more. */
-static int next_run(int state, int on, const int least[], int first, int last)
-{
-    int off = least[0], n = least[0] + least[1];
-    if (first > last || (on ? last == 0 : first > 0)) return -1;
-    if (on) return state >= off ? state + (state < n - 1) : state == off - 1 ? off : -1;
-    return state < off ? state + (state < off - 1) : state == n - 1 ? 0 : -1;
-}
-
-/* Take from decisions what no sequence of levels allows; return the least cost of starts, or BIG. */
+/* Take from decisions what no sequence of levels allows; return the least cost of starts, or BIG.
+   The states of an action are 1, .., least[0] steps off, then 1, .., least[1] steps on. Each step
+   leads to the next state, from the last one to the first; the last ones off and on also stay. */
 static real allowed(policy_state *s, signed char *first, signed char *last)
 {
     real total = 0;
-    int a, i, k, on, to, reach[2];
+    int a, i, k;
     for (a = 0; a < POLICY_LEVELS; a++, first += DECIDED, last += DECIDED) {
-        const int *least = LEAST_STEPS + 2 * a, off = least[0], n = least[0] + least[1];
+        const int off = LEAST_STEPS[2 * a], n = off + LEAST_STEPS[2 * a + 1];
         int run = s->runs[LEVEL_ACTION[a]];
         real cost = BIG;
-        for (k = 0; k <= DECIDED; k++)
-            for (i = 0; i < n; i++) s->ahead[k][i] = BIG;
+        for (i = 0; i < n; i++) s->ahead[0][i] = BIG;
         if (run <= 0) s->ahead[0][run == 0 || -run > off ? off - 1 : -run - 1] = 0;
-        if (run >= 0) s->ahead[0][run == 0 || run > least[1] ? n - 1 : off + run - 1] = 0;
+        if (run >= 0) s->ahead[0][run == 0 || off + run > n ? n - 1 : off + run - 1] = 0;
         for (k = 0; k < DECIDED; k++)
-            for (i = 0; i < n; i++)
-                for (on = 0; on < 2 && s->ahead[k][i] < BIG; on++) {
-                    real by = on && i < off ? START_COST[a][k] : 0;
-                    if ((to = next_run(i, on, least, first[k], last[k])) < 0) continue;
-                    s->ahead[k + 1][to] = smaller(s->ahead[k + 1][to], s->ahead[k][i] + by);
-                }
+            for (i = 0; i < n; i++) {
+                real least = s->ahead[k][i ? i - 1 : n - 1] + (i == off ? START_COST[a][k] : 0);
+                int left = i < off ? first[k] == 0 : last[k] >= 1 && last[k] >= first[k];
+                if (i == off - 1 || i == n - 1) least = smaller(least, s->ahead[k][i]);
+                s->ahead[k + 1][i] = left ? smaller(least, BIG) : BIG;
+            }
         for (i = 0; i < n; i++) cost = smaller(cost, s->ahead[DECIDED][i]);
         if (cost >= BIG) return BIG;
         for (k = DECIDED - 1; k >= 0; k--) { /* from where the end is not reached costs BIG */
-            reach[0] = reach[1] = 0;
+            real *now = s->ahead[k], reach[2] = {BIG, BIG};
+            const real *then = s->ahead[k + 1];
             for (i = 0; i < n; i++) {
-                int ends = 0;
-                for (on = 0; on < 2 && s->ahead[k][i] < BIG; on++) {
-                    to = next_run(i, on, least, first[k], last[k]);
-                    if (to >= 0 && s->ahead[k + 1][to] < BIG) ends = reach[on] = 1;
-                }
-                if (!ends) s->ahead[k][i] = BIG;
+                int stays = (i == off - 1 || i == n - 1) && then[i] < BIG;
+                reach[i >= off] = smaller(reach[i >= off], then[i]);
+                if (then[i + 1 < n ? i + 1 : 0] >= BIG && !stays) now[i] = BIG;
             }
-            if (!reach[0] && first[k] == 0) first[k] = 1;
-            if (!reach[1]) last[k] = 0;
+            if (reach[0] >= BIG && first[k] == 0) first[k] = 1;
+            if (reach[1] >= BIG) last[k] = 0;
         }
         total += cost;
     }

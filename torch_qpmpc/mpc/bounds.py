@@ -14,7 +14,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_flag, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout
-from torch_qpmpc.mpc.levels import read_levels
+from torch_qpmpc.mpc.levels import hull, read_levels
 from torch_qpmpc.mpc.parametrizations import LinearRows
 from torch_qpmpc.mpc.validation import as_tensor, read_numbers
 
@@ -117,8 +117,11 @@ class Bounds:
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
         x = _matching_pair("state_bounds", self.state_bounds, n_x)
         u = _matching_pair("action_bounds", self.action_bounds, n_u)
-        if self.action_levels is not None and self.level_rows is None:
-            u = _hull(u, self.action_levels)
+        if (levels := self.action_levels) is not None and self.level_rows is None:
+            if len(levels) != n_u:
+                want = f"{n_u}, one for each action, or None"
+                raise QPError.expected("action_levels", f"{len(levels)} entries", want)
+            u = hull("action_bounds", u, levels, [f"action {i}" for i in range(n_u)])
         lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
         n_linear = layout.n_mixed + layout.n_terminal
         price = _matching_slack("constraint_slack", self.constraint_slack, n_linear)
@@ -160,20 +163,6 @@ def _side(name: str, values: Any, side: int) -> Tensor:
         want = ("lower bounds below inf", "upper bounds above -inf")[side]
         raise QPError.expected(name, f"{values.tolist()}", want)
     return values.detach().clone()
-
-
-def _hull(
-    bounds: tuple[Tensor, Tensor], levels: Sequence[Sequence[float]]
-) -> tuple[Tensor, Tensor]:
-    """Return bounds within the lowest and the highest level of actions on levels."""
-    lower, upper = (side.clone() for side in bounds)
-    for a, own in enumerate(levels):
-        if own and a < len(lower):
-            if not any(lower[a] <= x <= upper[a] for x in own):
-                got, want = f"levels {[*own]}", f"one within [{lower[a]:g}, {upper[a]:g}]"
-                raise QPError.expected("action_levels", got, want, "Widen action_bounds.")
-            lower[a], upper[a] = max(lower[a], own[0]), min(upper[a], own[-1])
-    return lower, upper
 
 
 def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,15 +16,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
-from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.kernels import levels as kernel
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_numpy
 from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
 from torch_qpmpc.qp.pipeline.solve import report, solve_programs
-from torch_qpmpc.qp.program import UNKNOWN, QuadraticProgram, Status
+from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
 from torch_qpmpc.qp.tracing import is_eager
@@ -33,7 +31,7 @@ from torch_qpmpc.qp.tracing import is_eager
 ON_LEVEL = 1e-6
 #: The curvature of a search where H has none, relative to the cost's slope and the levels.
 CURVATURE = 1e-7
-#: The statuses of the search's outcomes.
+#: The statuses with a plan and without, of a search that ends and of one at its cap.
 STATUSES = np.array([Status.SOLVED, Status.NODE_LIMIT, Status.INFEASIBLE, Status.NOT_CONVERGED])
 #: What has no use without levels.
 DEFAULTS = {"min_on": 1, "min_off": 1, "start_cost": 0.0, "integer_horizon": None}
@@ -68,41 +66,33 @@ class Levels:
         """Return the levels of a scheme; None without any.
 
         Raises:
-            QPError: levels do not fit the sizes, bounds, prices or blocks.
+            QPError: levels do not fit the horizon, prices or blocks.
         """
         bounds, layout = scheme.bounds, scheme.layout
         if bounds.action_levels is None or not any(bounds.action_levels):
             check_used("action_levels", {name: getattr(bounds, name) for name in DEFAULTS})
             return None
-        n_u, N = layout.n_u, layout.horizon
-        if len(bounds.action_levels) != n_u:
-            got = f"{len(bounds.action_levels)} entries"
-            raise QPError.expected("action_levels", got, f"{n_u}, one for each action, or None")
         if layout.blocks:
             want = "no blocks: a level is decided in each stage"
             raise QPError.expected("blocks", f"{layout.blocks}", want, "Pass an integer_horizon.")
-        S = N if bounds.integer_horizon is None else bounds.integer_horizon
-        if S > N:
+        N = layout.horizon
+        if (S := bounds.integer_horizon or N) > N:
             raise QPError.expected("integer_horizon", f"{S}", f"at most the horizon {N}")
         actions = np.flatnonzero([bool(x) for x in bounds.action_levels])
         given = [bounds.action_levels[a] for a in actions]
         most = max(map(len, given))
         values = np.array([[*own, *own[-1:] * (most - len(own))] for own in given])
-        own, k, mixed = bounds.level_rows, np.arange(S), N * layout.n + layout.n_x
-        rows = (k * layout.n + layout.n_x + a for a in actions)
-        if own is not None:
-            rows = (mixed + k * layout.n_mixed + own[a] for a in actions)
-        rows = np.stack([*rows])
+        first, size = layout.n_x + actions, layout.n
+        if (own := bounds.level_rows) is not None:
+            first, size = N * layout.n + layout.n_x + np.take(own, actions), layout.n_mixed
+        rows = first[:, None] + size * np.arange(S)
         entries = rows + (layout.n_p - layout.n_x) if own is None else None
         if not scheme.theta["w"][rows].isinf().all():
             remedy = "Leave action_slack out, or inf for these actions."
             want = "hard bounds of actions on levels"
             raise QPError.expected("action_slack", "a price", want, remedy)
         names = "min_off", "min_on", "start_cost"
-        off, on, cost = (_numbers(x, getattr(bounds, x), n_u)[actions] for x in names)
-        for name, steps in (("min_off", off), ("min_on", on)):
-            for x in steps:
-                check_whole(name, float(x) if x % 1 else int(x), 1)
+        off, on, cost = (_numbers(x, getattr(bounds, x), layout.n_u)[actions] for x in names)
         rules = np.stack((off, on), -1).astype(np.int64)
         starts = cost[:, None] * scheme.gamma ** np.arange(S)
         return cls(actions, rows, entries, values, rules, starts, bounds.max_nodes)
@@ -110,8 +100,8 @@ class Levels:
     @property
     def identity(self) -> list[Any]:
         """What values depend on, as lists."""
-        parts = self.values, self.rows, self.rules, self.starts
-        return [x.tolist() for x in parts] + [self.max_nodes]
+        own = (x.tolist() for x in (self.values, self.rows, self.rules, self.starts))
+        return [*own, self.max_nodes]
 
     def solve(
         self, qp: QuadraticProgram, fixed: Tensor, n_kept: int, solver: str, on_failure: str
@@ -131,62 +121,47 @@ class Levels:
             raise QPError.expected("action_levels", "a traced call", want)
         with torch.no_grad():
             programs, batch = Programs.of(*(x.detach().cpu() for x in theta), n_kept=n_kept)
-            B, (m, S) = len(programs), self.rows.shape
-            places, active, costs, outcomes, nodes, gaps = self.search(
-                programs, np.zeros((B, m), np.int64), np.full((B, m, S), -1)
-            )
-        found = places[:, 0, 0] >= 0
-        free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
-        places = np.where(free, places, -1)
-        best = self.held(qp, places, batch)
-        start = torch.from_numpy(active).reshape(*batch, active.shape[1]).to(qp.lb.device)
-        solution = solve(best, fixed, n_kept, solver, "mask", start)
-        status = solution.status.reshape(-1).cpu().numpy().copy()
-        status = np.where((status == 0) | ~found, STATUSES[outcomes], status)
-        failed = (status != Status.SOLVED) & (status != Status.NODE_LIMIT)
-        if failed.any() and on_failure != "mask":
-            report(np.where(failed, status, 0), batch, on_failure)
-        if (capped := status == Status.NODE_LIMIT).any() and on_failure != "mask":
-            why = Status.NODE_LIMIT.explanation
-            text = f"{capped.sum()} of {B} plans may not be the best: {why}."
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
-        to = qp.q.device
-        lost = torch.from_numpy(failed).reshape(batch).to(to)
-        of_starts = torch.from_numpy(costs).reshape(batch).to(to, qp.q.dtype)
-        value = torch.where(lost, torch.inf, solution.value + of_starts)
-        known = F.pad(fixed.detach(), (0, qp.n_z - fixed.shape[-1])).expand_as(solution.z)
-        z = solution.z.clone()
-        if self.entries is not None:  # a level to the last bit
-            decided = torch.from_numpy(places >= 0).reshape(*batch, *self.rows.shape).to(to)
-            level = best.lb[..., self.rows].to(z)
-            z[..., self.entries] = level.where(decided, z[..., self.entries])
-        parts = {name: getattr(solution, name) for name in ("chi", "lam", "xi")}
-        parts = {name: torch.where(lost[..., None], 0.0, x) for name, x in parts.items()}
-        gap = torch.from_numpy(np.where(capped, gaps, 0.0)).reshape(batch).to(to, qp.q.dtype)
-        return replace(
-            solution,
-            **parts,
-            qp=best,
-            z=torch.where(lost[..., None], known.to(qp.q.dtype), z),
-            active=solution.active.masked_fill(lost[..., None], UNKNOWN),
-            value=value,
-            status=torch.from_numpy(status).reshape(batch).to(to),
-            value_error=solution.value_error + gap / value.detach().abs().clamp(min=1e-12),
-            iterations=torch.from_numpy(nodes).reshape(batch).to(to),
-        )
+            found = self.search(programs)
 
-    def held(
-        self, qp: QuadraticProgram, places: np.ndarray, batch: Sequence[int]
-    ) -> QuadraticProgram:
-        """Return the QPs with decisions at the ``places`` ``(B, m, S)``; -1 leaves their bounds."""
-        at = torch.from_numpy(places).to(qp.lb.device).reshape(*batch, *self.rows.shape)
-        values = torch.from_numpy(self.values).to(qp.lb).expand(*batch, -1, -1)
-        level, sides = values.gather(-1, at.clamp(min=0)), []
-        for side in (qp.lb, qp.ub):
-            side = side.expand(*batch, -1).clone()
-            side[..., self.rows] = torch.where(at < 0, side[..., self.rows], level)
-            sides.append(side)
-        return replace(qp, lb=sides[0], ub=sides[1], check_values=False)
+        def batched(x: np.ndarray) -> Tensor:
+            return torch.from_numpy(x).reshape((*batch, *x.shape[1:])).to(qp.q.device)
+
+        places, active, costs, ends, nodes, gaps = map(batched, found)
+        free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
+        at = places.where(torch.from_numpy(free).to(places.device), -1)
+        none = places[..., 0, 0] < 0
+        best = self.held(qp, at)
+        lb = best.lb.masked_fill(none[..., None], torch.inf)  # above ub, where there is no plan
+        best = replace(best, lb=lb, check_values=False)
+        solution = solve(best, fixed, n_kept, solver, "mask", active)
+        status = solution.status.where((solution.status != Status.SOLVED) & ~none, ends)
+        capped = status == Status.NODE_LIMIT
+        if on_failure != "mask":
+            failed = status.masked_fill(capped, Status.SOLVED)
+            if failed.any():
+                report(failed.reshape(-1).numpy(force=True), batch, on_failure)
+            if capped.any():
+                why = Status.NODE_LIMIT.explanation
+                text = f"{capped.sum()} of {len(programs)} plans may not be the best: {why}."
+                warnings.warn(text, RuntimeWarning, stacklevel=4)
+        z, value = solution.z.clone(), solution.value + costs.to(qp.q.dtype)
+        if self.entries is not None:  # a level to the last bit
+            level = best.lb[..., self.rows].to(z)
+            z[..., self.entries] = level.where(at >= 0, z[..., self.entries])
+        gap = gaps.to(qp.q.dtype).where(capped, 0.0) / value.detach().abs().clamp(min=1e-12)
+        errors = solution.value_error + gap
+        other = {"status": status, "value_error": errors, "iterations": nodes}
+        return replace(solution, qp=best, z=z, value=value, **other)
+
+    def held(self, qp: QuadraticProgram, at: Tensor) -> QuadraticProgram:
+        """Return the QPs with decisions at places ``(*batch, m, S)``; -1 leaves their bounds."""
+        values = torch.from_numpy(self.values).to(qp.lb).expand(*at.shape[:-1], -1)
+        level, sides = values.gather(-1, at.clamp(min=0)), {}
+        for name in ("lb", "ub"):
+            side = getattr(qp, name).expand(*at.shape[:-2], -1).clone()
+            side[..., self.rows] = level.where(at >= 0, side[..., self.rows])
+            sides[name] = side
+        return replace(qp, **sides, check_values=False)
 
     def within(self, lb: np.ndarray, ub: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the first and the last level within bounds of rows ``(*batch, n_g)``.
@@ -201,9 +176,12 @@ class Levels:
         return np.where(inside.any(-1), inside.argmax(-1), inside.shape[-1]), last
 
     def search(
-        self, programs: Programs, runs: np.ndarray, hint: np.ndarray
+        self, programs: Programs, runs: np.ndarray | None = None, hint: np.ndarray | None = None
     ) -> tuple[np.ndarray, ...]:
-        """Return places of the levels, active sets, costs of starts, outcomes, nodes and gaps."""
+        """Return places of the levels, active sets, costs of starts, statuses, nodes and gaps.
+
+        Arguments are those of `Searches.solve`, with a dimension for the batch.
+        """
         n_f, theta, own = programs.n_f, programs.theta, programs.scaled()
         prepared, group, qps = own.prepared, own.group, own.reduced_qps()
         of, least = prepared.reduced(n_f).rows, 0.0
@@ -232,8 +210,11 @@ class Levels:
         lb, ub = (np.tile(x, (len(group) // len(x), 1)) for x in (theta.lb, theta.ub))
         lb[:, given], ub[:, given] = known - near, known + near
         first, last = self.within(lb, ub)
-        places, lam, costs, outcomes, nodes, gaps = kernel.search(
-            K, unit, group, free, lower, upper, w, rows, self.values, self.rules,
+        unit = np.pad(unit, ((0, 0), (0, 1)), constant_values=1.0)[:, rows, None]  # of -1 one
+        runs = np.zeros(first.shape[:2], np.int64) if runs is None else runs
+        hint = np.full(first.shape, -1) if hint is None else hint
+        places, lam, costs, capped, nodes, gaps = kernel.search(
+            K, group, free, lower, upper, w, rows, self.values[:, None] / unit, self.rules,
             self.starts, runs, first, last, hint, self.max_nodes,
         )  # fmt: skip
         active = np.zeros((len(group), theta.G.shape[1]), np.int8)
@@ -241,7 +222,8 @@ class Levels:
         active[:, of] = np.where(saturated, 2 * np.sign(lam), np.sign(lam))
         held = self.rows[rows >= 0]
         active[:, held] = np.where(active[:, held] == 0, 1, active[:, held])
-        return places, active, costs, outcomes, nodes, gaps
+        statuses = STATUSES[2 * (places[:, 0, 0] < 0) + capped]
+        return places, active, costs, statuses, nodes, gaps
 
 
 class Searches:
@@ -267,19 +249,18 @@ class Searches:
             hint: places of levels ``(m, S)`` that may be good, such as the last plan's.
         """
         levels, programs = self._levels, Programs(self._prepared, np.zeros(1, np.int64), fixed)
-        runs = np.zeros(len(levels.rows), np.int64) if runs is None else runs[levels.actions]
-        hint = np.full(levels.rows.shape, -1) if hint is None else hint
-        places, active, _, (outcome,), *_ = levels.search(programs, runs[None], hint[None])
-        if outcome not in (kernel.BEST, kernel.CAPPED):
-            return programs.unsolved(int(STATUSES[outcome])), places[0]
+        runs = None if runs is None else runs[None, levels.actions]
+        hint = None if hint is None else hint[None]
+        places, active, _, (status,), *_ = levels.search(programs, runs, hint)
+        if (places < 0).any():
+            return programs.unsolved(status), places[0]
         lb, ub = self._prepared.theta.lb.copy(), self._prepared.theta.ub.copy()
         held = np.take_along_axis(levels.values, places[0], 1)
         lb[:, levels.rows] = ub[:, levels.rows] = held
         programs = Programs(self._prepared.bounded(lb, ub), programs.group, fixed)
         solution = solve_programs(programs, self._solver, active)
         solution.lam[0, levels.rows] = 0.0
-        if not solution.status[0]:
-            solution.status[0] = STATUSES[outcome]
+        solution.status[0] = solution.status[0] or status
         return solution, places[0]
 
 
@@ -298,7 +279,7 @@ def read_levels(value: Any, name: str = "action_levels") -> tuple[tuple[float, .
     """
     want = "for each action ascending numbers, or None"
     try:
-        levels = tuple(() if x is None else tuple(float(v) for v in x) for x in value)
+        levels = tuple(() if x is None else tuple(map(float, x)) for x in value)
     except (TypeError, ValueError) as error:
         raise QPError.expected(name, repr(value), want) from error
     for own in levels:
@@ -313,12 +294,32 @@ def _numbers(name: str, value: Any, n_u: int) -> np.ndarray:
     """Return a number for each action.
 
     Raises:
-        QPError: they are not finite numbers >= 0, one or ``n_u``.
+        QPError: they are not finite numbers >= 0, of minimum times whole ones >= 1, or not n_u.
     """
+    of_time = np.bool_(name != "start_cost")
     try:
         numbers = np.broadcast_to(np.asarray(value, float), n_u)
     except (TypeError, ValueError):
         numbers = np.array([np.nan])
-    if not (np.isfinite(numbers) & (numbers >= 0)).all():
-        raise QPError.expected(name, repr(value), f"a number >= 0, or {n_u} of them")
+    if not (np.isfinite(numbers) & (numbers >= of_time) & (~of_time | (numbers % 1 == 0))).all():
+        want = "a whole number >= 1" if of_time else "a number >= 0"
+        raise QPError.expected(name, repr(value), f"{want}, or {n_u} of them")
     return numbers
+
+
+def hull(name: str, bounds: Any, levels: Sequence[Any], names: Sequence[str]) -> tuple[Any, Any]:
+    """Return bounds of inputs, arrays or tensors, at their lowest and highest levels within them.
+
+    Raises:
+        QPError: none of an input's levels is within its bounds.
+    """
+    lower, upper = (side + 0.0 for side in bounds)
+    for i, own in enumerate(levels):
+        kept = [x for x in own or () if lower[i] <= x <= upper[i]]
+        if own and not kept:
+            got = f"[{lower[i]:g}, {upper[i]:g}] of {names[i]}"
+            want = f"bounds with one of its levels {', '.join(f'{x:g}' for x in own)}"
+            raise QPError.expected(name, got, want)
+        if kept:
+            lower[i], upper[i] = kept[0], kept[-1]
+    return lower, upper

@@ -23,23 +23,20 @@ from torch_qpmpc.qp.kernels.linalg import compiled
 GAIN = 1e-13
 #: A row is on a level within this fraction of the levels' distance.
 ON_LEVEL = 1e-9
-#: Outcomes of a search: the best plan, the best of as many nodes as may be, no plan, none found.
-BEST, CAPPED, NONE, UNKNOWN = 0, 1, 2, 3
 
 
 @compiled
 def search(
-    K, unit, group, free, lower, upper, w, rows, values, rules, starts, runs, lows, highs, hint, cap
+    K, group, free, lower, upper, w, rows, values, rules, starts, runs, lows, highs, hint, cap
 ):
     """Return the best plans on levels of B QPs.
 
     Args:
         K: ``(M, r, r)``, with a unit diagonal.
-        unit: the units of the rows, ``(M, r)``.
         group: the index of each QP's K, ``(B,)``.
         free, lower, upper, w: ``(B, r)``.
         rows: the row of each decision ``(m, S)``, -1 for one that is fixed.
-        values: ascending levels, ``(m, L)``.
+        values: ascending levels in the units of the rows, ``(M, m, S, L)``.
         rules: the fewest steps off and on, ``(m, 2)``.
         starts: the costs of starts, ``(m, S)``.
         runs: steps on, or minus steps off, before the plan; 0 if unknown, ``(B, m)``.
@@ -49,26 +46,24 @@ def search(
 
     Returns:
         The places of the levels ``(B, m, S)``, -1 without a plan, multipliers ``(B, r)``, and
-        ``(B,)`` costs of starts, outcomes, numbers of nodes, and costs above the lower bound.
+        ``(B,)`` costs of starts, whether it ended at the cap, numbers of nodes, and costs above
+        the lower bound.
     """
     B, r = free.shape
     m, S = rows.shape
     plans, lams = np.full((B, m, S), -1), np.zeros((B, r))
-    outcomes, nodes = np.zeros(B, np.int64), np.zeros(B, np.int64)
+    capped, nodes = np.zeros(B, np.bool_), np.zeros(B, np.int64)
     gaps, costs = np.zeros(B), np.zeros(B)
     low, high, lam, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
     side, held, factor = np.zeros(r, np.int64), np.empty(r + 1, np.int64), np.empty((r + 1, r + 1))
     first, last = np.empty((m, S), np.int64), np.empty((m, S), np.int64)
     pattern, ahead = np.empty((m, S), np.int64), np.empty((S + 1, rules.sum(1).max()))
-    most = m * S * (values.shape[1] - 1) + 1
+    most = m * S * (values.shape[3] - 1) + 1
     at, cut, bounds = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most)
     above, untried = np.empty(most, np.bool_), np.empty(most, np.bool_)
-    levels, near = np.empty((m, S, values.shape[1])), np.empty((m, S))
     for i in range(B):
-        for a in range(m):
-            for k in range(S):
-                levels[a, k] = values[a] / (unit[group[i], rows[a, k]] if rows[a, k] >= 0 else 1.0)
-                near[a, k] = ON_LEVEL * (levels[a, k, -1] - levels[a, k, 0])
+        levels = values[group[i]]
+        near = ON_LEVEL * (levels[:, :, -1] - levels[:, :, 0])
         low[:], high[:], lam[:], side[:] = lower[i], upper[i], 0.0, 0
         n, depth, best, limit, hinted = 0, 0, np.inf, np.inf, hint[i, 0, 0] >= 0
         while True:
@@ -127,9 +122,8 @@ def search(
         for e in range(depth):
             if untried[e] or e == depth - 1:
                 gaps[i] = max(gaps[i], best - bounds[e])
-        found, open_ = best < np.inf, depth > 0
-        outcomes[i] = (CAPPED if open_ else BEST) if found else (UNKNOWN if open_ else NONE)
-    return plans, lams, costs, outcomes, nodes, gaps
+        capped[i] = depth > 0
+    return plans, lams, costs, capped, nodes, gaps
 
 
 @compiled
@@ -155,57 +149,42 @@ def _undecided(first, last, levels, near, rows, y, pattern, any_):
 
 
 @compiled
-def _next(state, on, rule, first, last):
-    """Return the state after a step on or off, -1 if that is not left to it.
-
-    The states are 1, .., rule[0] steps off, then 1, .., rule[1] steps on, the last of each or more.
-    """
-    off, n = rule[0], rule[0] + rule[1]
-    if first > last or (last == 0 if on else first > 0):
-        return -1
-    if on:
-        return min(state + 1, n - 1) if state >= off else off if state == off - 1 else -1
-    return min(state + 1, off - 1) if state < off else 0 if state == n - 1 else -1
-
-
-@compiled
 def _allowed(firsts, lasts, rules, starts, runs, ahead):
     """Take from decisions what no sequence allows; return the least cost of starts, or inf.
 
-    ``ahead`` ``(S + 1, n)`` is scratch: the least cost of a sequence to each state.
+    ``ahead`` ``(S + 1, n)`` is scratch: the least cost of a sequence to each state. The states are
+    1, .., rule[0] steps off, then 1, .., rule[1] steps on. Each step leads to the next state, from
+    the last one to the first; the last state off and the last one on also stay.
     """
     total, S = 0.0, firsts.shape[1]
     for a in range(len(firsts)):
-        rule, first, last, run, cost = rules[a], firsts[a], lasts[a], runs[a], np.inf
-        off, n = rule[0], rule[0] + rule[1]
-        ahead[:, :] = np.inf
+        first, last, run, cost = firsts[a], lasts[a], runs[a], np.inf
+        off, n = rules[a, 0], rules[a, 0] + rules[a, 1]
+        ahead[0, :] = np.inf
         if run <= 0:
             ahead[0, off - 1 if run == 0 else min(-run, off) - 1] = 0.0
         if run >= 0:
-            ahead[0, n - 1 if run == 0 else off + min(run, rule[1]) - 1] = 0.0
+            ahead[0, n - 1 if run == 0 else min(off + run, n) - 1] = 0.0
         for k in range(S):
             for s in range(n):
-                for on in range(2 if ahead[k, s] < np.inf else 0):
-                    to = _next(s, on, rule, first[k], last[k])
-                    if to >= 0:
-                        by = starts[a, k] if on and s < off else 0.0
-                        ahead[k + 1, to] = min(ahead[k + 1, to], ahead[k, s] + by)
+                least = ahead[k, s - 1 if s else n - 1] + (starts[a, k] if s == off else 0.0)
+                if s == off - 1 or s == n - 1:
+                    least = min(least, ahead[k, s])
+                left = first[k] == 0 if s < off else last[k] >= max(first[k], 1)
+                ahead[k + 1, s] = least if left else np.inf
         for s in range(n):
             cost = min(cost, ahead[S, s])
         if cost == np.inf:
             return np.inf
         for k in range(S - 1, -1, -1):  # inf from where the end is not reached
-            off_ends, on_ends = False, False
+            may_off, may_on = False, False
             for s in range(n):
-                ends = False
-                for on in range(2 if ahead[k, s] < np.inf else 0):
-                    to = _next(s, on, rule, first[k], last[k])
-                    if to >= 0 and ahead[k + 1, to] < np.inf:
-                        ends = True
-                        off_ends, on_ends = off_ends or not on, on_ends or on == 1
-                if not ends:
+                reached = ahead[k + 1, s] < np.inf
+                may_off, may_on = may_off or (reached and s < off), may_on or (reached and s >= off)
+                stays = reached and (s == off - 1 or s == n - 1)
+                if not stays and ahead[k + 1, s + 1 if s < n - 1 else 0] == np.inf:
                     ahead[k, s] = np.inf
-            first[k] = first[k] if off_ends else max(first[k], 1)
-            last[k] = last[k] if on_ends else 0
+            first[k] = first[k] if may_off else max(first[k], 1)
+            last[k] = last[k] if may_on else 0
         total += cost
     return total
