@@ -117,6 +117,23 @@ def test_noise_is_drawn_from_the_seed():
     assert not np.array_equal(runs[0], runs[2])
 
 
+def test_sensor_noise_is_not_the_noise_of_an_environment():
+    class Noise(gymnasium.Env):
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.seen = [np.zeros(1)]
+            return self.seen[0], {}
+
+        def step(self, u):
+            self.seen.append(self.np_random.normal(size=1))
+            return self.seen[-1], 0.0, False, False, {}
+
+    env = Noise()
+    run = made().simulate(env, 200, r=[0.0], noise=1.0)
+    noise = run.y - np.array(env.seen)
+    assert not np.isin(noise[:-1].round(9), np.array(env.seen).round(9)).any()
+
+
 def test_an_environment_forecasts_the_known_signals():
     class Rain(gymnasium.Env):
         """y+ = 0.9 y + 0.5 u + 0.3 rain, with a forecast of 11 rows or of none."""

@@ -12,7 +12,14 @@ from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 from tests.envs.test_kalman_filter import model
 from tests.rollouts import network_policy
 from tests.store import Store
-from torch_qpmpc.envs import GrosZanonLTI, KalmanFilter, LinearSystemEnv, PlantEnv, PointMass
+from torch_qpmpc.envs import (
+    GrosZanonLTI,
+    KalmanFilter,
+    LinearSystem,
+    LinearSystemEnv,
+    PlantEnv,
+    PointMass,
+)
 from torch_qpmpc.errors import QPError
 
 
@@ -53,6 +60,15 @@ def test_rollouts_depend_on_the_seed_only(make):
     assert (rollout(5) == rollout(5)).all()
     assert (rollout(6, reseed=5) == rollout(5)).all()
     assert not (rollout(5) == rollout(6)).all()
+
+
+def test_exploration_after_the_same_seed_is_not_the_noise():
+    class Own(PointMass):
+        stream = LinearSystem.stream
+
+    own, torchs = Own().vectorised(4, 6, seed=5).rng, torch.Generator().manual_seed(5)
+    draws = [torch.rand(5000, generator=rng, dtype=torch.float64) for rng in (own, torchs)]
+    assert not torch.isin(*draws).any()
 
 
 def test_without_a_seed_the_global_generator_decides(make):

@@ -16,6 +16,7 @@ import torch_qpmpc as qm
 from tests.refused import refused
 from tests.transitions import transitions
 from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc.analysis.structure import predictions
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.learning.operators import QPActorValueOperator, warm_policy
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
@@ -338,6 +339,7 @@ def test_what_needs_one_model_refuses_dynamics():
     calls = [
         lambda: mpc.at_rest(),
         lambda: mpc.model(),
+        lambda: predictions(mpc),
         lambda: qm.export_c(mpc, "unused"),
         lambda: largest_difference(mpc, mpc, Polytope.box([-1.0] * 2, [1.0] * 2)),
     ]

@@ -80,7 +80,10 @@ def test_a_file_without_a_part_is_named(tmp_path):
     content = torch.load(tmp_path / "file")
     del content["mpc"]["q"]
     torch.save(content, tmp_path / "file")
-    with pytest.raises(QPError, match=r"^file: got .*/file \(Error\(s\) in loading .* Missing key"):
+    message = (
+        r"^file: got .*/file \(Error\(s\) in loading .* Missing key.*wrote\. Restore the file\.$"
+    )
+    with pytest.raises(QPError, match=message):
         QPMPC.load(tmp_path / "file")
 
 

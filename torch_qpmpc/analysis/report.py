@@ -24,7 +24,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.riccati import lqr_gain, stage_weight
-from torch_qpmpc.mpc.validation import check_one_model, without_gradients
+from torch_qpmpc.mpc.validation import without_gradients
 
 #: A, B, offset and E.
 TrueModel = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -111,7 +111,6 @@ def read(
         (True, 0.97)
     """
     check_kind("mpc", mpc, QPMPC)
-    check_one_model(mpc)
     true = None if true_model is None else _checked_model(mpc, true_model)
     if at is not None:
         check_tensor("at", at, mpc.n_p, batched=False)

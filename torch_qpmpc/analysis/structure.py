@@ -24,7 +24,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout, band_distance
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import without_gradients
+from torch_qpmpc.mpc.validation import check_one_model, without_gradients
 
 FORM_REMEDY = "Pass torch_qpmpc.analysis.structure.predictions(mpc)."
 #: The largest accepted condition number of C's state columns, after scaling its rows. The relative
@@ -129,7 +129,8 @@ def prediction_form(
 
 
 def predictions(mpc: QPMPC) -> PredictionForm:
-    """Return the prediction form of the constraints, X = Phi p + Gamma U + phi."""
+    """Return the prediction form, X = Phi p + Gamma U + phi; `QPError` if there are dynamics."""
+    check_one_model(mpc)
     with torch.no_grad():
         return prediction_form(mpc.C, mpc.n_x, mpc.n_u, mpc.b, mpc.n_d)
 

@@ -326,7 +326,7 @@ def restored(path: str | Path, content: Mapping[str, Any], of: Callable[[Any], A
     try:
         return of(content)
     except Exception as error:  # damaged files raise errors of any type
-        raise damaged(Path(path), error, "a file that save wrote") from error
+        raise damaged(Path(path), error, "a file that save wrote", "Restore it.") from error
 
 
 def packed(value: Any) -> Any:

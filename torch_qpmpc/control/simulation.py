@@ -129,7 +129,8 @@ def closed_loop(
         rest = scaling.at_rest(model, u, own[0], memory.rest[0], near)
         states = [f"x{i + 1}" for i in range(len(model.A))]
         plant = _Model(model, own, rest if x is None else read_vector("x", x, states, 0.0))
-    rng, started = np.random.default_rng(seed), plant.reset(seed=seed)
+    entropy = seed if isinstance(plant, _Model) else (seed, 1)  # an environment draws from seed
+    rng, started = np.random.default_rng(entropy), plant.reset(seed=seed)
     if not (isinstance(started, tuple) and len(started) == 2):
         remedy = "Its reset returns the outputs and a dict."
         raise QPError.expected("plant", type(plant).__name__, "Gymnasium's reset and step", remedy)
@@ -176,8 +177,7 @@ class _Model:
     x: Array
     k: int = 0
 
-    def reset(self, *, seed: int) -> tuple[Array, dict]:
-        del seed
+    def reset(self, **_: int) -> tuple[Array, dict]:
         return self.model.C @ self.x, {}
 
     def step(self, u: Array) -> tuple[Array, dict]:

@@ -42,6 +42,7 @@ class GrosZanonLTI(LinearSystem):
     """
 
     clips_states: ClassVar[bool] = False
+    stream: ClassVar[int] = 0  # that of the published results
 
     w: float = 100.0
     _: KW_ONLY

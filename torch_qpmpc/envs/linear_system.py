@@ -94,6 +94,8 @@ class LinearSystem(ABC):
 
     #: True if a step clips s+ to its bounds; if False, they are soft and observations unbounded.
     clips_states: ClassVar[bool] = True
+    #: Makes a seed's numbers others than after ``torch.manual_seed``, as exploration draws them.
+    stream: ClassVar[int] = 0x9E3779B9
 
     A: Tensor
     B: Tensor
@@ -257,12 +259,12 @@ class LinearSystemEnv(VectorisedEnv):
         check_kind("physics", physics, LinearSystem)
         super().__init__(num_envs, max_steps, dtype, device, seed)
         self.physics = p = physics.to(self.device)
+        self.stream = p.stream
         nu = self._reals(len(p.A))
         s = self._box(p.lb_s, p.ub_s) if p.clips_states else nu
         self._start({"observation": s}, {"noise": nu}, self._box(p.lb_a, p.ub_a), seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # Reset every environment: at a partial reset, TorchRL keeps the old values of the others.
         s = self.physics.starts(self.rng, self.batch_size[0])
         return self._observed(s, torch.zeros_like(s), self._zero_count())
 

@@ -152,7 +152,6 @@ class PlantEnv(VectorisedEnv):
         self._signals = self.plant.signals(self.rng, EPISODES, length)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # Reset every environment: at a partial reset, TorchRL keeps the old values of the others.
         x = self.plant.starts(self.rng, self.batch_size[0])
         count = self._zero_count()
         episode = torch.randint(EPISODES, count.shape, generator=self.rng, device=count.device)

@@ -6,7 +6,7 @@ s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -55,6 +55,7 @@ class PointMass(LinearSystem):
          tensor(3., dtype=torch.float64))
     """
 
+    stream: ClassVar[int] = 0  # that of the published results
     noise_kind: str = "gaussian"
     noise_std: float | None = None
     start_position: float = 1.5

@@ -42,12 +42,10 @@ class VectorisedEnv(EnvBase):
     ) -> None:
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
-        if seed is not None:
-            check_seed(seed)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        self.max_steps, self.dtype = max_steps, dtype
+        self.max_steps, self.dtype, self.stream = max_steps, dtype, 0
         self.rng = torch.Generator(device=self.device or "cpu")
 
     def _start(
@@ -72,8 +70,7 @@ class VectorisedEnv(EnvBase):
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _reals(self, size: int, dtype: torch.dtype | None = None) -> Unbounded:
-        shape = torch.Size([*self.batch_size, size])
-        return Unbounded(shape, dtype=dtype or self.dtype, device=self.device)
+        return Unbounded((*self.batch_size, size), dtype=dtype or self.dtype, device=self.device)
 
     def _box(self, low: Tensor, high: Tensor) -> Bounded:
         low, high = (b.to(self.dtype).expand(*self.batch_size, -1).clone() for b in (low, high))
@@ -82,7 +79,7 @@ class VectorisedEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             check_seed(seed)
-            self.rng.manual_seed(seed)
+            self.rng.manual_seed(seed ^ self.stream)
 
     def _zero_count(self) -> Tensor:
         return torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.rng.device)

@@ -525,10 +525,10 @@ class QPMPC(nn.Module):
             mpc = cls.of(**arguments)
             mpc.load_state_dict(content["mpc"])
         except Exception as error:  # damaged files raise errors of any type
-            remedy = {}
+            remedy = "Restore the file."
             if str(error).startswith("solver: "):  # the file is right, this process is not
-                remedy = {"remedy": "Register the backend of that name first."}
-            raise damaged(Path(path), error, "a file that QPMPC.save wrote", **remedy) from error
+                remedy = "Register the backend of that name first."
+            raise damaged(Path(path), error, "a file that QPMPC.save wrote", remedy) from error
         return mpc
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
