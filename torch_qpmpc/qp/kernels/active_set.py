@@ -47,7 +47,7 @@ def recall(active, group, fixed, dual, theta, reduced, sizes):
     g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), sizes.spans[0][:0]
     g = g_l_u[:, :d].copy()
     v, lam, steps = g, np.zeros((B, r)), np.ones(B, np.int64)
-    low, high, weight, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
+    low, high, weight, y, x = np.empty((5, r))
     sides, held, factor = np.zeros((B, r), np.int64), np.empty(r, np.int64), np.empty((r, r))
     for step in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 1):
         v, free = -products(dual.inverse, group, g, spans), -products(dual.rows, group, g, spans)

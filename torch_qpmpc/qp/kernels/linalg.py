@@ -117,9 +117,10 @@ def products(matrices, group, vectors, spans):
     for i in range(0, B if chunk else 0, max(1, chunk)):
         np.dot(vectors[i : i + chunk], matrices[0].T, out[i : i + chunk])
     for i in range(0 if chunk else B):
+        matrix, vector = matrices[group[i] % M], vectors[i % n]
         for j in range(rows):
             first, end = spans[j]
-            out[i, j] = dot(matrices[group[i] % M, j, first:end], vectors[i % n, first:end])
+            out[i, j] = dot(matrix[j, first:end], vector[first:end])
     return out
 
 
@@ -132,10 +133,11 @@ def transposed_products(matrices, group, vectors, spans):
     for i in range(0, B if chunk else 0, max(1, chunk)):
         np.dot(vectors[i : i + chunk], matrices[0], out[i : i + chunk])
     for i in range(0 if chunk else B):
+        matrix, vector, total = matrices[group[i] % M], vectors[i % n], out[i]
         for j in range(rows):
-            (first, end), factor = spans[j], vectors[i % n, j]
-            if factor != 0:
-                add(out[i, first:end], factor, matrices[group[i] % M, j, first:end])
+            factor = vector[j]
+            for k in range(spans[j, 0], spans[j, 1] if factor != 0 else 0):
+                total[k] += factor * matrix[j, k]
     return out
 
 
@@ -289,12 +291,14 @@ def multipliers(factors, pivots, spans, group, left):
         for k in range(n_c):
             x[k] = -left[i, pivots[group[i] % M, k]]
         for k in range(n_c):
-            end = spans[k, 1]
             x[k] /= L_U[k, k]
-            add(x[k + 1 : end], -x[k], L_U[k, k + 1 : end])
+            factor = x[k]
+            for j in range(k + 1, spans[k, 1]):
+                x[j] -= factor * L_U[k, j]
         for k in range(n_c - 1, -1, -1):
-            first = spans[k, 0]
-            add(x[first:k], -x[k], L_U[k, first:k])
+            factor = x[k]
+            for j in range(spans[k, 0], k):
+                x[j] -= factor * L_U[k, j]
     return chi
 
 
@@ -304,9 +308,10 @@ def sparse_products(left, right, of_left, of_right):
     M = max(len(left), len(right))
     out = np.zeros((M, left.shape[1], right.shape[2]))
     for m in range(M):
+        A, B, product = left[m % len(left)], right[m % len(right)], out[m]
         for i in range(left.shape[1]):
             for j in range(of_left[i, 0], of_left[i, 1]):
-                factor, (first, end) = left[m % len(left), i, j], of_right[j]
-                if factor != 0:
-                    add(out[m, i, first:end], factor, right[m % len(right), j, first:end])
+                factor = A[i, j]
+                for k in range(of_right[j, 0], of_right[j, 1] if factor != 0 else 0):
+                    product[i, k] += factor * B[j, k]
     return out

@@ -51,10 +51,11 @@ MATRICES = (0, 3, 5)
 
 def kept(make: Callable[Concatenate[Prepared, P], T]) -> Callable[Concatenate[Prepared, P], T]:
     """Keep what a function of prepared QPs returns for its other arguments."""
+    name = make.__name__
 
     @wraps(make)
     def get(self: Prepared, *args: P.args, **kwargs: P.kwargs) -> T:
-        key = make.__name__, *args
+        key = name, *args
         if key not in self.known:
             self.known[key] = make(self, *args, **kwargs)
         return self.known[key]
@@ -184,7 +185,7 @@ def prepared_for(data: Sequence[np.ndarray], n_kept: int) -> Prepared:
     return prepared
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Programs:
     """B QPs: their prepared theta, and the values ``fixed`` ``(B, n_f)`` of the first entries of z.
 
