@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import ObservationNorm, SerialEnv, TransformedEnv, check_env_specs
 
 from tests.envs.test_kalman_filter import model
 from tests.rollouts import network_policy
@@ -46,6 +46,15 @@ def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
 def test_torchrl_accepts_the_specs(make):
     check_env_specs(make(3, 5, dtype=torch.float64, seed=0), seed=0)
     check_env_specs(SerialEnv(2, lambda: make(3, 5, dtype=torch.float32)), seed=0)
+
+
+def test_a_transform_of_the_observation_does_not_move_the_plant(make):
+    env = make(4, 6, seed=5)
+    halved = TransformedEnv(make(4, 6, seed=5), ObservationNorm(0.0, 0.5, ["observation"]))
+    action = torch.ones(4, *env.action_spec.shape[1:])
+    plain, other = (x.rollout(5, lambda td: td.set("action", action)) for x in (env, halved))
+    torch.testing.assert_close(other["observation"], 0.5 * plain["observation"])
+    assert torch.equal(other["next", "reward"], plain["next", "reward"])
 
 
 def test_rollouts_depend_on_the_seed_only(make):

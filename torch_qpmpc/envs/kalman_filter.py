@@ -18,6 +18,8 @@ from torch_qpmpc.identification.innovations import Innovations
 
 #: The steps of an episode whose gains differ from the last one's, at most.
 STEPS = 1000
+#: The key of the last estimate, whatever later transforms make of the observation.
+KEPT = "filter_estimate"
 
 
 class KalmanFilter(Transform):
@@ -130,7 +132,7 @@ class KalmanFilter(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         y, memory = next_tensordict[self.observation_key], tensordict[self.memory_key]
         memory = memory if self.missing else memory.squeeze(-1)
-        x, u, n_d = tensordict[self.estimate_key], tensordict["action"], self.E.shape[-1]
+        x, u, n_d = tensordict[KEPT], tensordict["action"], self.E.shape[-1]
         d = tensordict["preview"][..., :n_d] if n_d else x[..., :0]
         return self._kept(next_tensordict, y, *self._corrected(self._predicted(x, u, d), y, memory))
 
@@ -143,7 +145,8 @@ class KalmanFilter(Transform):
 
     def _kept(self, data: TensorDictBase, y: Tensor, x: Tensor, memory: Tensor) -> TensorDictBase:
         memory = memory if self.missing else memory.unsqueeze(-1)
-        return data.set(self.estimate_key, x.to(y)).set(self.memory_key, memory)
+        data.set(self.estimate_key, x.to(y)).set(KEPT, x.to(y, copy=True))
+        return data.set(self.memory_key, memory)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Set the estimate's spec, which is unbounded, and that of the count."""
@@ -174,10 +177,7 @@ class KalmanFilter(Transform):
         if got != want or not y.dtype.is_floating_point:
             got = f"outputs and actions of sizes {got}, {y.dtype}"
             raise QPError.expected("the environment", got, f"real vectors of sizes {want}")
-        size = torch.Size([*y.shape[:-1], len(self.A)])
+        x = Unbounded((*y.shape[:-1], len(self.A)), dtype=y.dtype, device=y.device)
         memory, dtype = ([len(self.A)] * 2, self.A.dtype) if self.missing else ([1], torch.int64)
-        memory = torch.Size([*y.shape[:-1], *memory])
-        return {
-            self.estimate_key: Unbounded(size, dtype=y.dtype, device=y.device),
-            self.memory_key: Unbounded(memory, dtype=dtype, device=y.device),
-        }
+        memory = Unbounded((*y.shape[:-1], *memory), dtype=dtype, device=y.device)
+        return {self.estimate_key: x, KEPT: x.clone(), self.memory_key: memory}

@@ -237,7 +237,7 @@ class LinearSystemGymEnv(gymnasium.Env):
 class LinearSystemEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` episodes of a `LinearSystem`, as in `VectorisedEnv`.
 
-    The hidden entries are ``noise``, the last nu ``(num_envs, n_x)``, and ``step_count``.
+    The hidden entries are ``state``, ``step_count`` and ``noise``, the last nu ``(num_envs, n_x)``.
 
     Args:
         physics: the system.
@@ -262,18 +262,19 @@ class LinearSystemEnv(VectorisedEnv):
         self.stream = p.stream
         nu = self._reals(len(p.A))
         s = self._box(p.lb_s, p.ub_s) if p.clips_states else nu
-        self._start({"observation": s}, {"noise": nu}, self._box(p.lb_a, p.ub_a), seed)
+        self._start({"observation": s}, {"state": nu, "noise": nu}, self._box(p.lb_a, p.ub_a), seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         s = self.physics.starts(self.rng, self.batch_size[0])
         return self._observed(s, torch.zeros_like(s), self._zero_count())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        s, a = tensordict["observation"], tensordict["action"]
+        s, a = tensordict["state"], tensordict["action"]
         draw = self.physics.draw(self.rng, self.batch_size[0])
         nu = self.physics.noise(tensordict["noise"], draw)
         out = self._observed(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
         return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(self.dtype))
 
     def _observed(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
-        return self._pack(step_count, observation=s.to(self.dtype), noise=nu.to(self.dtype))
+        s = s.to(self.dtype)
+        return self._pack(step_count, observation=s, state=s.clone(), noise=nu.to(self.dtype))

@@ -54,13 +54,12 @@ class VectorisedEnv(EnvBase):
         """Set the specs and the seed; hidden entries are inputs and outputs of a step."""
         count = self._reals(1, dtype=torch.int64)
         hidden = {**hidden, "step_count": count}
-        shape = self.batch_size
         flags = ("done", "terminated", "truncated")
         flag = Categorical(2, shape=count.shape, dtype=torch.bool, device=self.device)
 
         def composite(specs: dict[str, Any]) -> Composite:
             copies = {name: spec.clone() for name, spec in specs.items()}
-            return Composite(copies, shape=shape, device=self.device)
+            return Composite(copies, shape=self.batch_size, device=self.device)
 
         self.state_spec = composite(hidden)
         self.observation_spec = composite({**observed, **hidden})
