@@ -185,27 +185,27 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
-    pairs = _filtered(model, _signals(trajectories))
+    pairs = _filtered(model, signals(trajectories))
     x = np.concatenate([(x @ model.A.T + moved)[:-1] for x, moved in pairs])
     return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
 
 
-def _signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
+def signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
+    """Return the outputs, and the inputs with the known signals, of each trajectory."""
     return [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
 
 
 def _errors(model: Innovations, trajectories: Sequence[Trajectory], horizon: int) -> list[Array]:
     """Return multi-step errors ``(T, horizon, n_y)`` of each trajectory."""
-    return _each(model, _signals(trajectories), lambda y, u, d: model.errors(y, u, d, horizon))
+    return each(model, signals(trajectories), lambda y, u, d: model.errors(y, u, d, horizon))
 
 
-def _each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
+def each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
     """Return what ``of`` says of each trajectory's y, u and d; it takes those of equal length."""
-    found: list[Any] = [None] * len(data)
+    found: dict[int, Any] = {}
     for places, y, v in batches(data):
-        for i, one in zip(places, of(y, *np.split(v, [model.B.shape[1]], -1)), strict=True):
-            found[i] = one
-    return found
+        found |= zip(places, of(y, *np.split(v, [model.B.shape[1]], -1)), strict=True)
+    return [found[i] for i in range(len(data))]
 
 
 # The choice
@@ -329,7 +329,7 @@ def _filtered(model: Innovations, data: Sequence[Signals]) -> list[tuple[Array, 
     def both(y: Array, *v: Array) -> Iterator[tuple[Array, Array]]:
         return zip(model.estimates(y, *v), np.pad(model.inputs(*v), pad), strict=True)
 
-    return _each(model, data, both)
+    return each(model, data, both)
 
 
 def _score(total: Array, count: Array) -> float:
