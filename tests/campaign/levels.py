@@ -21,7 +21,6 @@ import torch
 
 import torch_qpmpc as qm
 from tests.mpc.test_levels import drawn, enumerated
-from torch_qpmpc.mpc.levels import Searches
 from torch_qpmpc.qp.pipeline.batch import Programs
 
 #: The largest relative difference of two values.
@@ -215,12 +214,14 @@ def times(designs: int, states: int, by_scip: int) -> None:
         A, B = np.array([[rng.uniform(0.8, 0.98), 0.1], [0.0, 0.8]]), np.array([[0.05], [0.2]])
         weights = {"stage_weight": [1.0, 0.1, 0.05], "action_levels": [(0.0, 1.0)]}
         mpc = qm.QPMPC.from_model(A, B, N, **weights, solver="daqp", on_failure="mask")
-        policy, searches, qp = qm.CompiledPolicy(mpc), Searches(mpc), mpc.quadratic_program()
+        policy, qp = qm.CompiledPolicy(mpc), mpc.quadratic_program()
+        assert mpc.levels is not None
+        plan = partial(mpc.levels.plan, mpc.at_rest(), runs=np.zeros(1, np.int64), hint=None)
         for k, p in enumerate(rng.normal(size=(states, 2)) - 1):
             s = torch.from_numpy(p)
             if not k:
-                searches.solve(p[None])
-            timed("Python, certified", partial(searches.solve, p[None]))
+                plan(fixed=p[None])
+            timed("Python, certified", partial(plan, fixed=p[None]))
             policy.reset()
             timed("C, certified", partial(policy, s[None]))
             nodes.append(int(mpc.solve(s).iterations))

@@ -168,10 +168,10 @@ def test_bounds_are_those_of_the_levels_within_them():
 @refused(
     ({"u_levels": {"p": LEVELS}}, "u_levels: got {'p': .*, expected a mapping from"),
     ({"u_levels": LEVELS}, "u_levels: got .* expected a mapping"),
-    ({"u_levels": {"q": 3}}, "u_levels: got .3., expected for each action ascending"),
+    ({"u_levels": {"q": 3}}, "u_levels: got .3., expected for each action up to 100 ascending"),
     ({"min_on": {"T": 2}}, "min_on: got 'T', expected names among q"),
     ({"u_bounds": {"q": (1.0, 2.0)}}, "u_bounds: got .1, 2. of q"),
-    ({"u_levels": None}, "min_on: got {'q': 3}, expected u_levels"),
+    ({"u_levels": None}, "min_on: got {'q': 3}, expected action_levels or u_levels"),
     ({"du_bounds": {"q": (-4.0, 3.0)}}, "du_bounds: got .-4, 3. of q, expected moves of 4"),
     ({"blocks": [2, 6]}, "blocks: .* expected no blocks"),
 )

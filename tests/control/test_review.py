@@ -10,7 +10,6 @@ import torch
 import torch_qpmpc as qm
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.state_space import read_model
-from torch_qpmpc.export.tables import make_tables
 
 LAG = ([[0.9]], [[0.5]])
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
@@ -135,8 +134,7 @@ def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
         (u,) = looped.step(y, [0.0])
         cost += float(y @ y) + 0.1 * (u - last) ** 2
         x, last = 0.9 * (x + 0.02 * (k == 1)) + 0.5 * u, u
-    tables = make_tables(mpc.plan), make_tables(mpc.targets)
-    linear, noise = LinearLoop.of(mpc, looped.observer, *tables), mpc.design.plant.noise
+    linear, noise = LinearLoop.of(mpc, looped.observer), mpc.design.plant.noise
     assert noise is not None
     assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
     held = 1 + (0.9 * 0.02) ** 2 / (1 - 0.9**2)
@@ -305,7 +303,7 @@ def test_a_learned_cost_that_is_indefinite_is_named():
 def test_the_linear_loop_is_that_of_the_controller(options):
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1, **options)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc.plan, mpc.targets)))
+    loop = LinearLoop.of(mpc, controller.observer)
     A, B, C = loop.plant
     state, constant = np.zeros(len(loop.A)), np.array([0.1, -0.2, 0.3])  # load, bias and r
     controller.reset(y=[0.0])
@@ -321,7 +319,7 @@ def test_the_margin_is_that_of_the_loop_s_gain():
     """The loop is unstable from the gain on that the margin of one input allows at least."""
     mpc = qm.LinearMPC(INTEGRATOR, 8, Q=1.0, R=0.1, dR=0.1)
     controller = qm.Controller(mpc)
-    loop = LinearLoop.of(mpc, controller.observer, *map(make_tables, (mpc.plan, mpc.targets)))
+    loop = LinearLoop.of(mpc, controller.observer)
     A_c, B_c, C_c, D_c = loop.controller
     A, B, C = loop.plant
     margin = loop.modulus_margin()

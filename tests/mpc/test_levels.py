@@ -236,7 +236,7 @@ def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):
 
 
 @refused(
-    ({"action_levels": [(1.0, 0.0)]}, "action_levels: got .1.0, 0.0., expected for each"),
+    ({"action_levels": [(1.0, 0.0)]}, "action_levels: got ..1.0, 0.0.., expected for each"),
     ({"action_levels": [(0.0, 1.0), None]}, "action_levels: got 2 entries, expected 1"),
     ({"action_levels": 3.0}, "action_levels: got 3.0"),
     ({"action_bounds": ([0.5], [1.5])}, r"action_bounds: got \[0.5, 1.5\] of action 0, expected"),
@@ -246,7 +246,10 @@ def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):
     ({"min_on": 1.5}, "min_on: got 1.5"),
     ({"min_off": 0}, "min_off: got 0"),
     ({"start_cost": -1.0}, "start_cost: got -1.0, expected a number >= 0, or 1 of them"),
-    ({"action_levels": None, "min_on": 2}, "min_on: got 2, expected action_levels beside it"),
+    (
+        {"action_levels": None, "min_on": 2},
+        "min_on: got 2, expected action_levels or u_levels",
+    ),
     ({"max_nodes": 0}, "max_nodes: got 0"),
 )
 def test_wrong_levels_are_errors(options):

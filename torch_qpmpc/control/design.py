@@ -16,7 +16,7 @@ from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
 from torch_qpmpc.control.scaling import Scaling, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.levels import DEFAULTS, check_used, hull, read_levels
+from torch_qpmpc.mpc.levels import DEFAULTS, hull, read_levels
 from torch_qpmpc.mpc.scheme import check_keywords
 from torch_qpmpc.mpc.validation import as_tensor, check_weight
 
@@ -118,7 +118,10 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-        self._check_levels()
+        inputs = self.plant.inputs
+        levels = [*map(self.levels.get, inputs)]
+        bounds = hull("u_bounds", self.u_bounds, levels, inputs, self.du_bounds)
+        object.__setattr__(self, "u_bounds", bounds)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
         if (self.y_bounds[0] + self.margins[0] > self.y_bounds[1] - self.margins[1]).any():
@@ -137,18 +140,6 @@ class Design:
         parts = [f"{y} by {u}", *([f"known {d}"] if d else []), f"horizon {self.horizon}"]
         parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
         return "; ".join(parts)
-
-    def _check_levels(self) -> None:
-        """Take the bounds of inputs to their levels, and check that moves reach the next ones."""
-        inputs, levels = self.plant.inputs, [*map(self.levels.get, self.plant.inputs)]
-        bounds = hull("u_bounds", self.u_bounds, levels, inputs)
-        object.__setattr__(self, "u_bounds", bounds)
-        for name, own, *ends in zip(inputs, levels, *bounds, *self.du_bounds, strict=True):
-            lower, upper, down, up = ends
-            gap = np.diff([x for x in own or () if lower <= x <= upper]).max(initial=0.0)
-            if not down <= -gap <= gap <= up:
-                got = f"[{down:g}, {up:g}] of {name}"
-                raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
 
     def merged(self, name: str, changes: Mapping[str, Any], names: Sequence[str]) -> Any:
         """Return an argument of `LinearMPC` as it is, but for those ``names`` in ``changes``.
@@ -561,25 +552,22 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
     return read | {"limits": limits}
 
 
-def read_switching(
-    u_levels: Any, plant: StateSpace, rules: Mapping[str, Any], horizon: int | None, nodes: int
-) -> tuple[dict[str, tuple[float, ...]], dict[str, Any]]:
-    """Read the levels of inputs by name, and the other arguments of `Bounds` for them.
+def read_switching(u_levels: Any, plant: StateSpace, **rules: Any) -> dict[str, Any]:
+    """Read the levels of inputs by name, and as ``switching`` the arguments of `Bounds` for them.
 
     Raises:
         QPError: a name is no input with levels, or a level is no number.
     """
     if not u_levels:
-        check_used("u_levels", {**rules, "integer_horizon": horizon})
-        return {}, {}
+        return {"switching": rules}
     if not isinstance(u_levels, Mapping) or {*u_levels} - {*plant.inputs}:
         raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
     levels = dict(zip(u_levels, read_levels([*u_levels.values()], "u_levels"), strict=True))
-    switching = {"integer_horizon": horizon, "max_nodes": nodes}
-    for name, value in rules.items():
-        own = dict(zip(levels, read_vector(name, value, [*levels], DEFAULTS[name]), strict=True))
-        switching[name] = tuple(float(own.get(x, DEFAULTS[name])) for x in plant.inputs)
-    return {name: own for name, own in levels.items() if own}, switching
+    for name in ("min_on", "min_off", "start_cost"):
+        own = read_vector(name, rules[name], [*levels], DEFAULTS[name]).tolist()
+        own = dict.fromkeys(plant.inputs, DEFAULTS[name]) | dict(zip(levels, own, strict=True))
+        rules[name] = tuple(map(float, own.values()))
+    return {"levels": {name: own for name, own in levels.items() if own}, "switching": rules}
 
 
 def largest(bounds: tuple[Array, Array] | Array) -> Array:
@@ -678,19 +666,13 @@ def read_weight(name: str, value: Any, names: Sequence[str]) -> Array:
     return weight
 
 
-def read_wished(name: str, value: Any, names: Sequence[str]) -> Array:
-    """Read a number for each name, NaN where None or no entry of a mapping asks for the default."""
-    if value is None or isinstance(value, Mapping):
-        value = {key: x for key, x in (value or {}).items() if x is not None}
-    numbers = read_vector(name, value, names, 0.0)
-    by_default = isinstance(value, Mapping) and [key not in value for key in names]
-    return np.where(by_default, np.nan, numbers)
-
-
 def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
-    """Read the numbers that are given by name."""
-    pairs = zip(names, read_wished(name, value, names).tolist(), strict=True)
-    return {key: x for key, x in pairs if not np.isnan(x)}
+    """Read numbers by name, but for those that None or no entry of a mapping leaves out."""
+    value = {} if value is None else value
+    numbers = dict(zip(names, read_vector(name, value, names, 0.0).tolist(), strict=True))
+    if isinstance(value, Mapping):
+        return {key: numbers[key] for key, x in value.items() if x is not None}
+    return numbers
 
 
 def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ import torch
 from torch_qpmpc.control.design import Design
 from torch_qpmpc.control.disturbance import PREFIX
 from torch_qpmpc.control.law import PLANNED, Law, Memory, Outcome, Signals
-from torch_qpmpc.control.review import Setting, hard_rows, set_points
+from torch_qpmpc.control.review import hard_rows, set_points
 from torch_qpmpc.control.simulation import Run, last_known
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
@@ -105,7 +105,7 @@ def explain(
     limits = () if plan is None else _limits(design, plan.lam[0], np.vstack((now.y, y)), u, known)
     w = law.estimates(memory)[1]
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
-    findings = [set_points(Setting(mpc, w, known[0]), memory.r, False)]
+    findings = [set_points(mpc, w, known[0], memory.r, False)]
     findings += [hard_rows(design)] * (status == Outcome.INFEASIBLE)
     reach = "\n".join(f"{x.text} {x.remedy}".rstrip() for x in findings)
     return Explanation(design, status, now, u, y, limits, names, reach)

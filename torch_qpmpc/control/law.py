@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.control.design import Design, Target, largest, read_wished
+from torch_qpmpc.control.design import Design, Target, largest, read_said
 from torch_qpmpc.control.disturbance import PREFIX
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import aimed
@@ -28,7 +28,6 @@ from torch_qpmpc.control.observer import (
 )
 from torch_qpmpc.control.state_space import Array, read_table
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.mpc.levels import Searches
 from torch_qpmpc.mpc.nonlinear import SequentialQP
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.solve import AtRest
@@ -164,9 +163,9 @@ class Law:
         return self.mpc.design
 
     @cached_property
-    def plans(self) -> AtRest | Searches:
+    def plans(self) -> AtRest:
         """The solver of the plan's QP, with the theta of its first use."""
-        return Searches(self.mpc.plan) if self.mpc.plan.levels else self.mpc.plan.at_rest()
+        return self.mpc.plan.at_rest()
 
     @cached_property
     def aims(self) -> AtRest:
@@ -281,9 +280,10 @@ class Law:
                 found = search.solve(qp, fixed, len(p) + plan.n_u, plan.solver, "mask", start)
             parts = (getattr(found, name).numpy() for name in BatchSolution._fields)
             return BatchSolution(*parts), found.later.numpy()
-        if isinstance(self.plans, AtRest):
+        if (levels := self.mpc.plan.levels) is None:
             return self.plans.solve(p[None]), None
-        plan, places = self.plans.solve(p[None], memory.runs, memory.ahead)
+        assert memory.runs is not None
+        plan, places = levels.plan(self.plans, p[None], memory.runs, memory.ahead)
         return plan, np.append(places[:, 1:], places[:, -1:], 1)
 
     def _moved(self, target: Target, known: Array, w: Array) -> Callable[..., Tensor]:
@@ -310,11 +310,12 @@ class Law:
     def check_runs(self, memory: Memory) -> None:
         """Raise `QPError` if a minimum time holds an input on or off, and its bounds do not."""
         lower, upper = self.design.u_bounds
+        runs = np.zeros(len(lower)) if memory.runs is None else memory.runs
         for name, own in self.design.levels.items():
             i = self.design.plant.inputs.index(name)
-            on, levels = memory.runs[i] > 0, [x for x in own if lower[i] <= x <= upper[i]]
+            on, levels = runs[i] > 0, [x for x in own if lower[i] <= x <= upper[i]]
             rule = "min_on" if on else "min_off"
-            left = self.design.switching[rule][i] - abs(memory.runs[i])
+            left = self.design.switching[rule][i] - abs(runs[i])
             if left > 0 and all((x > self.switches[i]) != on for x in levels):
                 got = f"levels {', '.join(f'{x:g}' for x in levels)} of {name}"
                 want = f"one that is {rule[4:]} for {left:g} more steps, by {rule}"
@@ -496,8 +497,8 @@ class Law:
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:
     """Read standard deviations, which must be positive; None asks for the default."""
-    wished = read_wished(name, value, names)
-    vector = np.where(np.isnan(wished), default, wished)
+    said = read_said(name, value, names)
+    vector = np.array([said.get(key, x) for key, x in zip(names, default, strict=True)])
     if not ((vector > 0) & np.isfinite(vector)).all():
         got = ", ".join(f"{x:g} of {key}" for key, x in zip(names, vector, strict=True))
         raise QPError.expected(name, got, "a standard deviation > 0 of each")

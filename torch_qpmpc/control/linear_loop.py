@@ -16,7 +16,7 @@ from torch_qpmpc.control.design import Design, Target
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
-from torch_qpmpc.export.tables import Tables
+from torch_qpmpc.export.tables import make_tables
 
 #: Frequencies, from SLOWEST to alternating samples; doublings of the time until noise settles.
 FREQUENCIES, SLOWEST, DOUBLINGS = 400, 1e-4, 50
@@ -38,9 +38,9 @@ class LinearLoop:
     units: Array
 
     @classmethod
-    def of(cls, mpc: LinearMPC, observer: Observer, plan: Tables, target: Tables) -> LinearLoop:
-        """Return the loop of an MPC and an observer, from the tables of the plan and the target."""
-        K_e, K_u, K_r = _gains(mpc, plan, target)
+    def of(cls, mpc: LinearMPC, observer: Observer) -> LinearLoop:
+        """Return the loop of an MPC, whose cost is positive definite, and an observer."""
+        K_e, K_u, K_r = _gains(mpc)
         plant, F, G, L = mpc.design.plant, observer.F, observer.G, observer.L
         m, corrected = plant.B.shape[1], np.eye(len(F)) - L @ observer.H
         # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
@@ -105,9 +105,9 @@ class LinearLoop:
         return float(np.linalg.svd(np.eye(len(D_c)) - loop, compute_uv=False)[:, -1].min())
 
 
-def _gains(mpc: LinearMPC, plan: Tables, target: Tables) -> tuple[Array, Array, Array]:
+def _gains(mpc: LinearMPC) -> tuple[Array, Array, Array]:
     """Return the gains of the unconstrained law on the estimate e, u_last and r."""
-    design = mpc.design
+    design, plan, target = mpc.design, make_tables(mpc.plan), make_tables(mpc.targets)
     n, m, n_y, n_d = design.plant.sizes
     n_w = len(design.disturbances.names)
     signals = torch.eye(n + n_w + m + n_y, dtype=torch.float64)

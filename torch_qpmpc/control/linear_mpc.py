@@ -155,7 +155,7 @@ class LinearMPC:
         bounds = {"y_bounds": y_bounds, "u_bounds": u_bounds, "du_bounds": du_bounds}
         wishes = read_wishes(plant, None, Q=Q, R=R, dR=dR, **wished, **bounds)
         rules = {"min_on": min_on, "min_off": min_off, "start_cost": start_cost}
-        levels, switching = read_switching(u_levels, plant, rules, integer_horizon, max_nodes)
+        rules |= {"integer_horizon": integer_horizon, "max_nodes": max_nodes}
         design = Design(
             plant=plant,
             horizon=int(horizon),  # pyright: ignore[reportArgumentType] - a number
@@ -165,8 +165,7 @@ class LinearMPC:
             disturbances=choose(plant, None),
             gamma=gamma,
             blocks=read_blocks(blocks, int(horizon)),  # pyright: ignore[reportArgumentType]
-            levels=levels,
-            switching=switching,
+            **read_switching(u_levels, plant, **rules),
         )
         own = choose(plant, disturbances, design.scaling)
         self._start(replace(design, disturbances=own), options)

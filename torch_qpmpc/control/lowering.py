@@ -193,8 +193,7 @@ def _bounds(design: Design) -> Bounds:
         D += bands.D @ (s["u"] - s["u_last"])
     last = (ends.W @ signals - ends.K @ s["known"])[:, :size]
     first, of_u = (bands.arguments == "y_bounds").sum(), np.isfinite(design.u_bounds).any(0)
-    levels = [design.levels.get(name) for name in design.plant.inputs]
-    levels = {"action_levels": levels, "level_rows": (first - 1 + np.cumsum(of_u)).tolist()}
+    levels = [*map(design.levels.get, design.plant.inputs)] if design.levels else None
     held = D[:, size:].any(-1) & ~D[:, : design.places["known"].stop].any(-1)
     return Bounds(
         constraints=(D, bands.lower, bands.upper) if len(D) else None,
@@ -202,7 +201,8 @@ def _bounds(design: Design) -> Bounds:
         constraint_slack=np.append(bands.price, ends.price),
         discount_slack=True,
         held=held if len(D) else None,
-        **(levels if design.levels else {}),
+        action_levels=levels,
+        level_rows=(first - 1 + np.cumsum(of_u)).tolist() if levels else None,
         **design.switching,
     )
 

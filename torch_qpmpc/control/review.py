@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
@@ -18,7 +18,7 @@ from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.simulation import centre, last_known, simulate
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import SolverError
-from torch_qpmpc.export.tables import SINGULAR, make_tables
+from torch_qpmpc.export.tables import SINGULAR
 from torch_qpmpc.qp.pipeline.condensing import null_space
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
@@ -95,13 +95,12 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         _horizon(design),
         _disturbances(design),
         hard_rows(design),
-        set_points(Setting(mpc, law.estimates(memory)[1], known), r_last, assumed),
+        set_points(mpc, law.estimates(memory)[1], known, r_last, assumed),
     ]
     findings += [_levels(law, r_last, known)] if design.levels else []
     if not cost.ok:
         return Review(findings)
-    plan, target = make_tables(mpc.plan), make_tables(mpc.targets)
-    loop = LinearLoop.of(mpc, law.observer, plan, target)
+    loop = LinearLoop.of(mpc, law.observer)
     findings.append(_stability(loop, design.gamma, terminal.remedy))
     if loop.radius < 1:
         findings += [_margin(loop, law), _offset(loop, design)]
@@ -260,26 +259,14 @@ def _levels(law: Law, r: Array, known: Array) -> Finding:
     return Finding("levels", not names, text, remedy * bool(names))
 
 
-class Setting(NamedTuple):
-    """An MPC at an estimate of the disturbances and at known signals that are held."""
+def set_points(mpc: LinearMPC, w: Array, known: Array, r_last: Array, assumed: bool) -> Finding:
+    """Return whether set-points and bands of outputs are within reach of the inputs' bounds.
 
-    mpc: LinearMPC
-    w: Array
-    known: Array
-
-    def off(self, y: Array, r: Array) -> Array:
-        """Return the mask of outputs with a weight that are off their set-points by a fault."""
-        design, near = self.mpc.design, SEEN * self.mpc.design.scaling.y
-        if design.plant.noise is not None:  # no one can see less than the outputs' own noise
-            near = np.maximum(near, np.sqrt(np.diag(design.plant.noise[1])))
-        return (np.diag(design.Q) > 0) & (np.abs(y - r) > near)
-
-
-def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
-    """Return whether set-points and bands of outputs are within reach of the inputs' bounds."""
-    design, known = setting.mpc.design, setting.known
-    plant, faults, (low, high) = design.plant, [], design.bounds_at(known, True)[0]
-    lower, upper = (reach := _reach(setting)).T
+    The estimate w of the disturbances and the known signals are held.
+    """
+    design, faults = mpc.design, []
+    plant, (low, high) = design.plant, design.bounds_at(known, True)[0]
+    lower, upper = (reach := _reach(design, w, known)).T
     acting = np.flatnonzero(plant.E.any(0))
     held = " and ".join(plant.quantity(plant.known[i], known[i]) for i in acting)
     at = f"At {held}{' (assumed)' * assumed} the" if held else "The"
@@ -294,11 +281,14 @@ def set_points(setting: Setting, r_last: Array, assumed: bool) -> Finding:
         if lower[i] > high[i] or upper[i] < low[i]:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")
     if len(r_last) and design.Q.any():
-        r, target = r_last[-1], setting.mpc.target(r_last[-1], *setting[1:])
+        r, target = r_last[-1], mpc.target(r_last[-1], w, known)
         y, size = target.y.numpy(), design.scaling.y
-        if (off := setting.off(y, r)).any():  # soft bounds that the nearest one violates move it
-            y = setting.mpc.target(np.where(off, np.clip(y, low, high), r), *setting[1:]).y.numpy()
-        for i in np.flatnonzero(setting.off(y, r)):
+        near = np.where(np.diag(design.Q) > 0, SEEN * size, np.inf)
+        if plant.noise is not None:  # no one can see less than the outputs' own noise
+            near = np.maximum(near, np.sqrt(np.diag(plant.noise[1])))
+        if (off := np.abs(y - r) > near).any():  # soft bounds that the nearest one violates move it
+            y = mpc.target(np.where(off, np.clip(y, low, high), r), w, known).y.numpy()
+        for i in np.flatnonzero(np.abs(y - r) > near):
             word = f"{round(y[i], 4 - int(np.floor(np.log10(size[i])))):.10g}"
             limits = _limits(design, target, known)
             faults.append(f"Set {plant.outputs[i]} to {word}, not {r[i]:.10g}, {limits}.")
@@ -319,15 +309,15 @@ def _limits(design: Design, target: Target, known: Array) -> str:
     return f"or widen {' or '.join(named)}" if named else impossible
 
 
-def _reach(setting: Setting) -> Array:
+def _reach(design: Design, w: Array, known: Array) -> Array:
     """Return the least and the largest steady value of each output, ``(n_y, 2)``, NaN without any.
 
     Inputs are within their bounds, and other outputs without a weight in their zones, if they can.
     """
-    design, bands, n_y = setting.mpc.design, setting.mpc.design.bands, len(setting.mpc.design.Q)
-    steady, loads = design.steady, np.concatenate((setting.w, setting.known, [1.0]))
+    bands, n_y, steady = design.bands, len(design.Q), design.steady
+    loads = np.concatenate((w, known, [1.0]))
     S, rest = bands.W @ np.vstack((steady.Y, steady.U)), bands.W @ np.vstack((steady.y, steady.u))
-    (lower, upper), rest = bands.at(setting.known - design.nominal), rest @ loads
+    (lower, upper), rest = bands.at(known - design.nominal), rest @ loads
     size = np.tile(bands.sizes(design.scaling.y, design.scaling.u), 2)
     rows = np.vstack((S, -S)) / size[:, None]
     limits = np.concatenate((upper - rest, rest - lower)) / size

@@ -71,9 +71,8 @@ def programs(mpc: QPMPC, p: Array) -> Programs:
 def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> BatchSolution:
     """Return the certified solutions of V at p ``(B, n_p)`` by a solver of the package."""
     if mpc.levels is not None:
-        qp, s = mpc.quadratic_program(), torch.as_tensor(p)
         with torch.no_grad():
-            best = mpc.levels.solve(qp, s, mpc.n_p + mpc.n_u, mpc.solver, "mask")
+            best = mpc._solve(torch.as_tensor(p), None, on_failure="mask")
         return BatchSolution._make(to_numpy(getattr(best, x)) for x in BatchSolution._fields)
     qps = programs(mpc, p)
     return solve_programs(qps, solver or ("torch" if _is_large(qps) else "daqp"))
@@ -91,12 +90,9 @@ def _is_large(qps: Programs) -> bool:
 
 
 def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
-    """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose.
-
-    Those of actions on levels, whose QPs differ from state to state, stay.
-    """
+    """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose."""
     qps, exact = programs(mpc, p), coarse.at(np.arange(len(p)))
-    if mpc.levels is not None:
+    if mpc.levels is not None:  # each plan has a QP of its own
         return exact
     if len(loose := which[exact.value_error[which] > DOUBTFUL]):
         exact.put(loose, reference(mpc, p[loose], "torch"))

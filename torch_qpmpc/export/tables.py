@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,16 +63,6 @@ class Rows:
         return self.Y, self.lower, self.upper, self.w, self.size, self.unit
 
 
-class Decisions(NamedTuple):
-    """Decisions ``(m, S)``: their rows in the table, values ``(m, S, L)``, and bounds as places."""
-
-    levels: Levels
-    rows: Array
-    values: Array
-    first: Array
-    last: Array
-
-
 @dataclass(frozen=True, eq=False)
 class Tables:
     """The tables of a policy in float64.
@@ -93,7 +82,7 @@ class Tables:
         centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
         usual: ``(n_p,)``, the size of an entry of p whose own cost is a half, one without a cost.
         constants: entries of p with one value only.
-        decisions: those of actions on levels, None without any.
+        levels, decisions: those of actions, None without any, and their arrays by names in C.
         digest: SHA-256 of the nine tensors of the QP.
     """
 
@@ -116,7 +105,8 @@ class Tables:
     centre: Array
     usual: Array
     constants: dict[int, float]
-    decisions: Decisions | None
+    levels: Levels | None
+    decisions: dict[str, Array]
     digest: str
 
 
@@ -174,11 +164,14 @@ def make_tables(mpc: QPMPC) -> Tables:
     known = _rows(*map(np.concatenate, pairs))
     u = slice(n_p, n_p + n_u)
     u_lower, u_upper = _action_bounds(original, lb, ub, w, u)
-    of_u, own, decisions = units[u], H.diagonal()[:n_p], None
+    of_u, own, decisions = units[u], H.diagonal()[:n_p], {}
     if levels := mpc.levels:
         at = np.searchsorted(on_plan, levels.rows)
-        values = levels.values[:, None] - (G[on_plan] @ z_0)[at, None]
-        decisions = Decisions(levels, at, values / unit[at, None], *levels.within(lb, ub))
+        values = (levels.values[:, None] - (G[on_plan] @ z_0)[at, None]) / unit[at, None]
+        decisions = {"LEVEL": values.reshape(at.size, -1), "START_COST": levels.starts}
+        decisions |= {"LEVEL_ROW": at, "LEVEL_ACTION": levels.actions, "LEAST_STEPS": levels.rules}
+        places = (x.astype(np.int8) for x in levels.within(lb, ub))
+        decisions |= dict(zip(("FIRST", "LAST"), places, strict=True))
     return Tables(
         n_p=n_p,
         n_u=n_u,
@@ -199,6 +192,7 @@ def make_tables(mpc: QPMPC) -> Tables:
         centre=_centre(qp, n_p, mpc.constants),
         usual=np.where(own > 0, own, 1.0) ** -0.5,
         constants=mpc.constants,
+        levels=levels,
         decisions=decisions,
         digest=digest(qp),
     )

@@ -86,7 +86,7 @@ def sources(tables: Tables, settings: Settings, header: str, examples: Examples)
             for key, size in sizes_of(tables, settings).items()
         ),
         "/* @TABLES@ */": _tables(tables, settings),
-        "/* @LEVELS@ */": filled("levels.c", settings.name) if tables.decisions else "",
+        "/* @LEVELS@ */": filled("levels.c", settings.name) if tables.levels else "",
         "/* @EXAMPLES@ */": _examples(tables, settings, examples),
     }
     return {f"{settings.name}.{end}": filled(f"policy.{end}", settings.name, parts) for end in "hc"}
@@ -112,7 +112,7 @@ def header(mpc: QPMPC, tables: Tables, settings: Settings) -> str:
         f"{settings.name}: the policy and value of a quadratic program, by torch_qpmpc "
         f"{version} on {today.isoformat()}.",
         f"The state has @BYTES@ bytes. A QP takes at most {settings.max_iterations} iterations.",
-        *[f"A step solves at most {x.levels.max_nodes + 1}." for x in [tables.decisions] if x],
+        *[f"A step solves at most {x.max_nodes + 1}." for x in [tables.levels] if x],
         f"SHA-256 of H, q, c, C, b, G, lb, ub, w: {tables.digest}",
         "",
         *(f"{_entries('p', *ends[i : i + 2])}: {name}" for i, name in enumerate(names)),
@@ -157,8 +157,8 @@ def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
     sizes |= {"KNOWN": len(tables.known), "D": d, "HELD": most, "HELD_": max(most, 1)}
     sizes |= {"TRIANGLE": max(most * (most + 1) // 2, 1), "FACTORED": int(small)}
     sizes |= {"WORK": d * small, "LEVELS": 0}
-    if tables.decisions:
-        levels, (m, S) = tables.decisions.levels, tables.decisions.rows.shape
+    if levels := tables.levels:
+        m, S = levels.rows.shape
         sizes |= {"LEVELS": m, "DECIDED": S, "DECISIONS": m * S, "NODES": levels.max_nodes}
         depth, runs = m * S * (levels.values.shape[1] - 1) + 1, max(levels.rules.sum(1))
         sizes |= {"DEPTH": depth, "RUNS": runs}
@@ -190,10 +190,10 @@ def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
         "V_PP": P[np.tril_indices(len(P))],
         "V_P": tables.g,
     }
-    if tables.decisions:
-        values = tables.decisions.values.reshape(-1, tables.decisions.values.shape[-1])
-        near = (1e-9 if settings.dtype == "float64" else 1e-5) * np.ptp(values, axis=-1)
-        arrays |= {"LEVEL": values, "ON_LEVEL": near, "START_COST": tables.decisions.levels.starts}
+    arrays |= {key: x for key, x in tables.decisions.items() if x.dtype.kind == "f"}
+    if tables.levels:
+        near = 1e-9 if settings.dtype == "float64" else 1e-5
+        arrays["ON_LEVEL"] = near * np.ptp(arrays["LEVEL"], axis=1)
     return arrays
 
 
@@ -208,12 +208,9 @@ def _tables(tables: Tables, settings: Settings) -> str:
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     lines += [array(name, x, dtype) for name, x in arrays_of(tables, settings).items()]
     lines.append(f"static const real V_OFFSET = {number(tables.c, dtype)};")
-    if tables.decisions:
-        levels, rows, _, first, last = tables.decisions
-        own = {"LEVEL_ACTION": levels.actions, "LEAST_STEPS": levels.rules, "LEVEL_ROW": rows}
-        lines += [integers(key, x.ravel()) for key, x in own.items()]
-        own = {"FIRST": first, "LAST": last}
-        lines += [integers(key, x.ravel(), "signed char") for key, x in own.items()]
+    for key, x in tables.decisions.items():
+        kind = "signed char" if x.dtype == np.int8 else "int"
+        lines += [integers(key, x.ravel(), kind)] * (x.dtype.kind == "i")
     return "\n".join(lines)
 
 

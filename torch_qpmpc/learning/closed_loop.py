@@ -490,8 +490,7 @@ def improve(
         (True, True)
     """
     check_kind("mpc", mpc, QPMPC)
-    if mpc.sequential is None:
-        check_no_levels(mpc, "gradients of closed loops")
+    check_no_levels(mpc, "gradients of closed loops")
     window = steps if window is None else window
     own = {"updates": updates, "loops": loops, "steps": steps, "window": window, "members": members}
     for name, size in own.items():

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.kernels import levels as kernel
-from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_numpy
-from torch_qpmpc.qp.pipeline.batch import Programs, prepared_for
-from torch_qpmpc.qp.pipeline.solve import report, solve_programs
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
+from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.solve import AtRest, report, solve_programs
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solve import solve
@@ -69,8 +69,11 @@ class Levels:
             QPError: levels do not fit the horizon, prices or blocks.
         """
         bounds, layout = scheme.bounds, scheme.layout
-        if bounds.action_levels is None or not any(bounds.action_levels):
-            check_used("action_levels", {name: getattr(bounds, name) for name in DEFAULTS})
+        if not any(bounds.action_levels or ()):
+            for name, default in DEFAULTS.items():
+                value = getattr(bounds, name)
+                if value is not None and np.any(np.not_equal(value, default)):
+                    raise QPError.expected(name, repr(value), "action_levels or u_levels")
             return None
         if layout.blocks:
             want = "no blocks: a level is decided in each stage"
@@ -129,10 +132,15 @@ class Levels:
         places, active, costs, ends, nodes, gaps = map(batched, found)
         free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
         at = places.where(torch.from_numpy(free).to(places.device), -1)
+        values = torch.from_numpy(self.values).to(qp.lb).expand(*at.shape[:-1], -1)
+        level, sides = values.gather(-1, at.clamp(min=0)), []
+        for side in (qp.lb, qp.ub):
+            side = side.expand(*batch, -1).clone()
+            side[..., self.rows] = level.where(at >= 0, side[..., self.rows])
+            sides.append(side)
         none = places[..., 0, 0] < 0
-        best = self.held(qp, at)
-        lb = best.lb.masked_fill(none[..., None], torch.inf)  # above ub, where there is no plan
-        best = replace(best, lb=lb, check_values=False)
+        lb = sides[0].masked_fill(none[..., None], torch.inf)  # above ub, where there is no plan
+        best = replace(qp, lb=lb, ub=sides[1], check_values=False)
         solution = solve(best, fixed, n_kept, solver, "mask", active)
         status = solution.status.where((solution.status != Status.SOLVED) & ~none, ends)
         capped = status == Status.NODE_LIMIT
@@ -146,22 +154,11 @@ class Levels:
                 warnings.warn(text, RuntimeWarning, stacklevel=4)
         z, value = solution.z.clone(), solution.value + costs.to(qp.q.dtype)
         if self.entries is not None:  # a level to the last bit
-            level = best.lb[..., self.rows].to(z)
-            z[..., self.entries] = level.where(at >= 0, z[..., self.entries])
+            z[..., self.entries] = level.to(z).where(at >= 0, z[..., self.entries])
         gap = gaps.to(qp.q.dtype).where(capped, 0.0) / value.detach().abs().clamp(min=1e-12)
         errors = solution.value_error + gap
         other = {"status": status, "value_error": errors, "iterations": nodes}
         return replace(solution, qp=best, z=z, value=value, **other)
-
-    def held(self, qp: QuadraticProgram, at: Tensor) -> QuadraticProgram:
-        """Return the QPs with decisions at places ``(*batch, m, S)``; -1 leaves their bounds."""
-        values = torch.from_numpy(self.values).to(qp.lb).expand(*at.shape[:-1], -1)
-        level, sides = values.gather(-1, at.clamp(min=0)), {}
-        for name in ("lb", "ub"):
-            side = getattr(qp, name).expand(*at.shape[:-2], -1).clone()
-            side[..., self.rows] = level.where(at >= 0, side[..., self.rows])
-            sides[name] = side
-        return replace(qp, **sides, check_values=False)
 
     def within(self, lb: np.ndarray, ub: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the first and the last level within bounds of rows ``(*batch, n_g)``.
@@ -180,7 +177,7 @@ class Levels:
     ) -> tuple[np.ndarray, ...]:
         """Return places of the levels, active sets, costs of starts, statuses, nodes and gaps.
 
-        Arguments are those of `Searches.solve`, with a dimension for the batch.
+        ``runs`` and ``hint`` are those of `plan`, for a batch of one.
         """
         n_f, theta, own = programs.n_f, programs.theta, programs.scaled()
         prepared, group, qps = own.prepared, own.group, own.reduced_qps()
@@ -211,8 +208,8 @@ class Levels:
         lb[:, given], ub[:, given] = known - near, known + near
         first, last = self.within(lb, ub)
         unit = np.pad(unit, ((0, 0), (0, 1)), constant_values=1.0)[:, rows, None]  # of -1 one
-        runs = np.zeros(first.shape[:2], np.int64) if runs is None else runs
-        hint = np.full(first.shape, -1) if hint is None else hint
+        runs = np.zeros(first.shape[:2], np.int64) if runs is None else runs[None, self.actions]
+        hint = np.full(first.shape, -1) if hint is None else hint[None]
         places, lam, costs, capped, nodes, gaps = kernel.search(
             K, group, free, lower, upper, w, rows, self.values[:, None] / unit, self.rules,
             self.starts, runs, first, last, hint, self.max_nodes,
@@ -225,50 +222,31 @@ class Levels:
         statuses = STATUSES[2 * (places[:, 0, 0] < 0) + capped]
         return places, active, costs, statuses, nodes, gaps
 
-
-class Searches:
-    """Searches for the best plan with a theta at rest, one after the other, in NumPy alone."""
-
-    @torch.no_grad()
-    def __init__(self, mpc: Any) -> None:
-        self._levels, self._solver = mpc.levels, mpc.solver
-        theta = [to_numpy(x) for x in mpc.quadratic_program().tensors()]
-        self._prepared = prepared_for(theta, mpc.n_p + mpc.n_u)
-
-    def solve(
-        self, fixed: np.ndarray, runs: np.ndarray | None = None, hint: np.ndarray | None = None
+    def plan(
+        self, at_rest: AtRest, fixed: np.ndarray, runs: np.ndarray, hint: np.ndarray | None
     ) -> tuple[BatchSolution, np.ndarray]:
-        """Return the best plan's solution, and the places of its levels ``(m, S)``.
+        """Return the best plan's solution with a theta at rest, and the places of its levels.
 
         Multipliers of decisions are zero.
 
         Args:
+            at_rest: the solver of the QPs.
             fixed: the first entries of z, ``(1, n_f)``.
-            runs: for how many steps each action was on, or with a minus off, ``(n_u,)``; 0, the
-                default, is unknown.
+            runs: for how many steps each action was on, or with a minus off, ``(n_u,)``; 0 is
+                unknown.
             hint: places of levels ``(m, S)`` that may be good, such as the last plan's.
         """
-        levels, programs = self._levels, Programs(self._prepared, np.zeros(1, np.int64), fixed)
-        runs = None if runs is None else runs[None, levels.actions]
-        hint = None if hint is None else hint[None]
-        places, active, _, (status,), *_ = levels.search(programs, runs, hint)
+        programs, prepared = at_rest.programs(fixed), at_rest.prepared
+        places, active, _, (status,), *_ = self.search(programs, runs, hint)
         if (places < 0).any():
             return programs.unsolved(status), places[0]
-        lb, ub = self._prepared.theta.lb.copy(), self._prepared.theta.ub.copy()
-        held = np.take_along_axis(levels.values, places[0], 1)
-        lb[:, levels.rows] = ub[:, levels.rows] = held
-        programs = Programs(self._prepared.bounded(lb, ub), programs.group, fixed)
-        solution = solve_programs(programs, self._solver, active)
-        solution.lam[0, levels.rows] = 0.0
+        lb, ub = prepared.theta.lb.copy(), prepared.theta.ub.copy()
+        lb[:, self.rows] = ub[:, self.rows] = np.take_along_axis(self.values, places[0], 1)
+        programs = Programs(prepared.bounded(lb, ub), programs.group, fixed)
+        solution = solve_programs(programs, at_rest.solver, active)
+        solution.lam[0, self.rows] = 0.0
         solution.status[0] = solution.status[0] or status
         return solution, places[0]
-
-
-def check_used(levels: str, given: dict[str, Any]) -> None:
-    """Raise `QPError` if minimum times and the like are ``given`` to actions without ``levels``."""
-    for name, value in given.items():
-        if value is not None and np.any(np.not_equal(value, DEFAULTS[name])):
-            raise QPError.expected(name, repr(value), f"{levels} beside it", f"Pass {levels}.")
 
 
 def read_levels(value: Any, name: str = "action_levels") -> tuple[tuple[float, ...], ...]:
@@ -277,16 +255,14 @@ def read_levels(value: Any, name: str = "action_levels") -> tuple[tuple[float, .
     Raises:
         QPError: they are not ascending.
     """
-    want = "for each action ascending numbers, or None"
     try:
         levels = tuple(() if x is None else tuple(map(float, x)) for x in value)
-    except (TypeError, ValueError) as error:
-        raise QPError.expected(name, repr(value), want) from error
+    except (TypeError, ValueError):
+        levels = ((np.nan,),)
     for own in levels:
-        steps = np.diff(own)
-        if own and not (len(own) <= MOST and np.isfinite(own).all() and (steps > 0).all()):
-            remedy = "The lowest level is off." + f" There may be {MOST}." * (len(own) > MOST)
-            raise QPError.expected(name, f"{[*own]}", want, remedy)
+        if not (len(own) <= MOST and np.isfinite(own).all() and (np.diff(own) > 0).all()):
+            want = f"for each action up to {MOST} ascending numbers, or None"
+            raise QPError.expected(name, repr(value), want, "The lowest level is off.")
     return levels
 
 
@@ -307,11 +283,14 @@ def _numbers(name: str, value: Any, n_u: int) -> np.ndarray:
     return numbers
 
 
-def hull(name: str, bounds: Any, levels: Sequence[Any], names: Sequence[str]) -> tuple[Any, Any]:
+def hull(
+    name: str, bounds: Any, levels: Sequence[Any], names: Sequence[str], moves: Any = None
+) -> tuple[Any, Any]:
     """Return bounds of inputs, arrays or tensors, at their lowest and highest levels within them.
 
     Raises:
-        QPError: none of an input's levels is within its bounds.
+        QPError: none of an input's levels is within its bounds, or bounds of its ``moves`` keep it
+            from the next one.
     """
     lower, upper = (side + 0.0 for side in bounds)
     for i, own in enumerate(levels):
@@ -320,6 +299,10 @@ def hull(name: str, bounds: Any, levels: Sequence[Any], names: Sequence[str]) ->
             got = f"[{lower[i]:g}, {upper[i]:g}] of {names[i]}"
             want = f"bounds with one of its levels {', '.join(f'{x:g}' for x in own)}"
             raise QPError.expected(name, got, want)
+        gap = np.diff(kept).max(initial=0.0)
+        if moves is not None and not moves[0][i] <= -gap <= gap <= moves[1][i]:
+            got = f"[{moves[0][i]:g}, {moves[1][i]:g}] of {names[i]}"
+            raise QPError.expected("du_bounds", got, f"moves of {gap:g}, to its next level")
         if kept:
             lower[i], upper[i] = kept[0], kept[-1]
     return lower, upper

@@ -44,7 +44,6 @@ from torch_qpmpc.mpc.validation import (
     STRUCTURES,
     check_dynamics,
     check_learn,
-    check_no_levels,
     check_one_model,
     check_pair,
     learned_entries,
@@ -667,8 +666,8 @@ class QPMPC(nn.Module):
 
     @torch.no_grad()
     def at_rest(self) -> AtRest:
-        """Return a solver of V's QPs, one by one, that keeps the current theta prepared."""
-        check_no_levels(self, "solves at rest")
+        """Return a solver of V's QPs, without levels, that keeps the current theta prepared."""
+        check_one_model(self)
         return AtRest(self.quadratic_program(), self.n_p, self.n_p + self.n_u, self.solver)
 
     def _action_at_rest(self, x: np.ndarray, warm: bool) -> np.ndarray | None:

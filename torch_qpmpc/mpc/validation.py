@@ -79,9 +79,7 @@ def check_dynamics(dynamics: Any, learn: Collection[str], levels: Any) -> None:
 
 
 def check_no_levels(mpc: Any, what: str) -> None:
-    """Raise `QPError` if a QPMPC has levels or dynamics, for ``what`` needs one QP."""
-    if mpc.sequential is not None:
-        raise QPError.expected("mpc", "one with dynamics", f"one with A and B, for {what}")
+    """Raise `QPError` if a QPMPC has levels, for ``what`` needs one QP."""
     if mpc.levels is not None:
         got, want = "one with action_levels", f"one without, for {what}"
         remedy = "A scheme with action_levels=None has the relaxed plan."

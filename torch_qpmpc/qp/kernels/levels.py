@@ -89,7 +89,7 @@ def search(
                     lam, y, side, held, n, factor, x, limit - cost,
                 )  # fmt: skip
             if least + cost < limit:
-                branch = _undecided(first, last, levels, near, rows, y, pattern, False)
+                branch, several = _undecided(first, last, levels, near, rows, y, pattern)
                 if branch < 0:
                     of_starts = _allowed(pattern, pattern, rules, starts, runs[i], ahead)
                     if least + of_starts < limit:
@@ -97,7 +97,7 @@ def search(
                         limit = best - GAIN * abs(best)
                         lams[i], plans[i] = lam, pattern
                     if of_starts > cost:
-                        branch = _undecided(first, last, levels, near, rows, y, pattern, True)
+                        branch = several
             if hinted:
                 hinted = False
                 continue
@@ -127,25 +127,25 @@ def search(
 
 
 @compiled
-def _undecided(first, last, levels, near, rows, y, pattern, any_):
-    """Return the first decision by stages, of those with several levels left, that is on none.
+def _undecided(first, last, levels, near, rows, y, pattern):
+    """Return the first decisions by stages that are on no level, and with several left, or -1.
 
-    With ``any_`` it is the first of those with several, and -1 if there is none. ``pattern`` gets
-    the nearest levels. A level alone is held, to the tolerance of a row.
+    ``pattern`` gets the nearest levels. A level alone is held, to the tolerance of a row.
     """
-    found = -1
+    found, several = -1, -1
     for k in range(pattern.shape[1]):
         for a in range(len(pattern)):
             best = first[a, k]
             if best < last[a, k]:
-                at = y[rows[a, k]]
+                at, one = y[rows[a, k]], a * pattern.shape[1] + k
+                several = one if several < 0 else several
                 for e in range(best + 1, last[a, k] + 1):
                     if abs(levels[a, k, e] - at) < abs(levels[a, k, best] - at):
                         best = e
-                if found < 0 and (any_ or abs(levels[a, k, best] - at) > near[a, k]):
-                    found = a * pattern.shape[1] + k
+                if found < 0 and abs(levels[a, k, best] - at) > near[a, k]:
+                    found = one
             pattern[a, k] = best
-    return found
+    return found, several
 
 
 @compiled

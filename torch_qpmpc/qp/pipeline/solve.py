@@ -185,13 +185,13 @@ class AtRest:
         self.prepared, self.solver = prepared_for(data, n_kept), solver
         self._active = np.zeros((1, qp.lb.shape[-1]), np.int8)
         # The certificate proves nothing without a convex cost.
-        self._is_sound = self._of(np.zeros((1, n_f))).scaled().solvable() is None
+        self._is_sound = self.programs(np.zeros((1, n_f))).scaled().solvable() is None
 
     def solve(self, fixed: np.ndarray, warm: bool = True) -> BatchSolution:
         """Solve QPs with the fixed entries ``(B, n_f)``, from the last active sets if ``warm``."""
         if not warm or len(fixed) != len(self._active):
             self._active = np.zeros((len(fixed), self._active.shape[1]), np.int8)
-        began, programs, log = time.perf_counter(), self._of(fixed), _active_log.get(None)
+        began, programs, log = time.perf_counter(), self.programs(fixed), _active_log.get(None)
         if (solution := self._recalled(programs)) is None:
             solution = solve_programs(programs, self.solver)
             if not any(solution.status):  # of one set, the solution is the same whatever led to it
@@ -214,7 +214,8 @@ class AtRest:
         self._active = solution.active
         return solution
 
-    def _of(self, fixed: np.ndarray) -> Programs:
+    def programs(self, fixed: np.ndarray) -> Programs:
+        """Return the QPs with these fixed entries."""
         return Programs(self.prepared, np.zeros(len(fixed), np.int64), fixed)
 
 
