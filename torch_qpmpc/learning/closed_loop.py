@@ -525,8 +525,9 @@ def improve(
         difference = (new - old).nan_to_num(0.0, torch.inf, -torch.inf)  # where both fail they tie
         test = PairedTest()
         test.add(difference)
-        changes = torch.stack([difference[i::members].mean() for i in range(members)])
-        worst = one_more(changes, test.alpha)
+        means = torch.stack([x[i::members].mean() for x in (old, new) for i in range(members)])
+        olds, news = means.chunk(2)
+        worst = 2 * one_more((news - olds) / (olds.abs() + news.abs()), test.alpha)
         kept = test.decision == "better" and not worst > 0
     finally:
         mpc.on_failure = on_failure
@@ -535,12 +536,12 @@ def improve(
             mpc.load_state_dict(before)
     ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
     notes = ("In one loop it costs far more: a veto.",) * test.vetoed
-    notes += (f"With one more model, as the plant is, it may cost {worst:.2g} more.",) * (worst > 0)
-    return Improvement(kept, *ends, int((changes < 0).sum()), members, notes)
+    notes += (f"With one more model, as the plant is, it may cost {worst:.0%} more.",) * (worst > 0)
+    return Improvement(kept, *ends, int((news < olds).sum()), members, notes)
 
 
 def one_more(changes: Tensor, alpha: float) -> float:
-    """Return what one more model's change exceeds with probability alpha; NaN from less than 2."""
+    """Return what one more model's change exceeds with probability alpha, NaN if one is finite."""
     d = changes[changes.isfinite()]
     variance = (d - d.mean()).square().sum() / (len(d) - 1)
     t = float(scipy.special.stdtrit(len(d) - 1, 1 - alpha))
