@@ -87,6 +87,25 @@ def test_a_quadratic_cost_has_no_network_on_a_nonlinear_plant():
     assert_close(model(x, torch.zeros(9, 1))[1], x[:, 0] ** 2, rtol=0, atol=1e-6)
 
 
+def test_safety_stock_is_held_where_the_cost_has_a_kink():
+    """The best stock to order up to is 8.35, where one day in ten has more demand, and costs 5.2.
+
+    Networks that are as smooth as others at the scale of the log's stocks predict twice this.
+    """
+    rng, log, cost = np.random.default_rng(3), [], []
+    for _ in range(30):
+        u, demand, y = rng.uniform(0, 12, 40), rng.gamma(4, 5 / 4, 40), np.full(41, 5.0)
+        for t in range(40):
+            y[t + 1] = y[t] + u[t] - demand[t]
+        log.append({"y": y, "u": u})
+        cost.append(np.maximum(y[1:], -9 * y[1:]))
+    model = identify_nonlinear(log, np.concatenate(cost))
+    stock = torch.linspace(0, 20, 81).double().unsqueeze(1)
+    expected = model(torch.zeros_like(stock), stock)[1]
+    assert expected.min() < 9
+    assert_close(stock[expected.argmin(), 0].item(), 8.35, rtol=0, atol=4)
+
+
 def test_noise_does_not_hide_the_curvature():
     model = identify_nonlinear(pendulum_log(noise=0.05))
     assert model.depth == 6

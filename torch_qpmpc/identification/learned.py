@@ -3,8 +3,8 @@
 With v = [d; x; u] the change x_{k+1} - x_k and the stage cost l_k, if there is one, are the mean of
 an ensemble of networks of v_k (Chua et al., 2018, "Deep reinforcement learning in a handful of
 trials using probabilistic dynamics models"), or linear and convex quadratic in v_k. Each network is
-trained without a part of the log, and its errors there decide for each entry. Networks of what the
-linear model leaves fit the log as well, and their sum with it is worse where the log is thin.
+trained without a part of the log; the errors there choose between smooth and sharp networks, and
+decide for each entry. Networks of what the linear model leaves are worse where the log is thin.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from torch_qpmpc.identification.ridge import ridge
 
 #: The networks, their width, and the steps, rate and batch of their training.
 COUNT, WIDTH, STEPS, RATE, BATCH = 5, 64, 2500, 3e-3, 128
+#: Hidden units are silu(s x) / s, with s from 1 to one of these, the second for kinks.
+SHARPEST = 1.0, 10.0
 #: A network predicts an entry if it leaves less than this share of the linear model's mean square,
 #: the cost of a nonlinear plant also near a tie with the quadratic; and none that the linear model
 #: leaves less of than this share of its variance.
@@ -150,17 +152,15 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
     wanted, layers, left = rest > EXACT * spread.square(), (), torch.ones_like(rest)
     if wanted.any():
         spread = torch.where(spread > 0, spread, 1.0)
-        layers, error = _trained(v.float(), ((target - mean) / spread).float())
+        inputs, outputs = v.float(), ((target - mean) / spread * wanted).float()
+        fits = [_trained(inputs, outputs, sharpest) for sharpest in SHARPEST]
+        layers, error = min(fits, key=lambda fit: fit[1][wanted].log().mean())
         left = torch.where(wanted, error * spread.square() / rest, 1.0)
-        W_1, b_1, W_2, b_2, W_3, b_3 = (x.detach().double() for x in layers)
         most = torch.where(torch.arange(len(left)) < n_x, LEFT, TIED)
         used = wanted * (left < most) * (left < LEFT).any()
-        first = W_1.movedim(0, 1).flatten(1), b_1.flatten()
-        last = (
-            (W_3 / COUNT).flatten(0, 1) * spread * used,
-            (b_3.mean((0, 1)) * spread + mean) * used,
-        )
-        layers, base = (*first, W_2, b_2, *last) if used.any() else (), base * ~used
+        *hidden, W, b = layers
+        last = W * spread * used, (b * spread + mean) * used
+        layers, base = (*hidden, *last) if used.any() else (), base * ~used
     return LearnedModel(middle, size, base, n_x, layers, left)
 
 
@@ -185,17 +185,18 @@ def _convex(linear: Tensor, features: Tensor, cost: Tensor) -> Tensor:
     return torch.cat((ridge(linear, cost - features[:, n:] @ entries), entries))
 
 
-def _trained(v: Tensor, target: Tensor) -> tuple[list[Tensor], Tensor]:
-    """Train each network without a part of the rows; return them, and their errors there."""
+def _trained(v: Tensor, target: Tensor, sharpest: float) -> tuple[list[Tensor], Tensor]:
+    """Train each network without a part of the rows; return them as one, and their errors there."""
     generator = torch.Generator().manual_seed(0)
     sizes, layers = (v.shape[1], WIDTH, WIDTH, target.shape[1]), []
+    s = sharpest ** torch.linspace(0, 1, WIDTH)
     for n, m in itertools.pairwise(sizes):
         layers += [torch.randn(COUNT, n, m, generator=generator) / n**0.5, torch.zeros(COUNT, 1, m)]
 
     def outputs(x: Tensor) -> Tensor:
         for i in range(0, len(layers), 2):
             x = torch.baddbmm(layers[i + 1], x, layers[i])
-            x = F.silu(x) if i + 2 < len(layers) else x
+            x = F.silu(s * x) / s if i + 2 < len(layers) else x
         return x
 
     parts = torch.arange(len(v)) * 2 * COUNT // len(v)
@@ -205,8 +206,7 @@ def _trained(v: Tensor, target: Tensor) -> tuple[list[Tensor], Tensor]:
     with torch.enable_grad():
         for _ in range(STEPS):
             draws = torch.rand(COUNT, BATCH, generator=generator)
-            rows = [pool[(x * len(pool)).long()] for pool, x in zip(pools, draws, strict=True)]
-            rows = torch.stack(rows)
+            rows = torch.stack([p[(x * len(p)).long()] for p, x in zip(pools, draws, strict=True)])
             loss = (outputs(v[rows]) - target[rows]).square().mean()
             adam.zero_grad()
             loss.backward()
@@ -214,4 +214,8 @@ def _trained(v: Tensor, target: Tensor) -> tuple[list[Tensor], Tensor]:
             rate.step()
     with torch.no_grad():
         own = outputs(v.expand(COUNT, *v.shape))[parts // 2, torch.arange(len(v))]
-        return layers, (own - target)[parts % 2 == 0].double().square().mean(0)
+        error = (own - target)[parts % 2 == 0].double().square().mean(0)
+        W_1, b_1, W_2, b_2, W_3, b_3 = (x.double() for x in layers)
+        first, column = ((W_1 * s).movedim(0, 1).flatten(1), (b_1 * s).flatten()), s.unsqueeze(1)
+        last = (W_3 / column).flatten(0, 1) / COUNT, b_3.mean((0, 1))
+        return [*first, W_2 / column * s, b_2 * s, *last], error

@@ -66,14 +66,10 @@ class Log:
         return f"{name} [{self.units[name]}]" if name in self.units else name
 
     def __str__(self) -> str:
-        signals = {"outputs": self.outputs, "inputs": self.inputs, "known": self.known}
-        named = "; ".join(
-            f"{kind} {', '.join(map(self.label, names))}"
-            for kind, names in signals.items()
-            if names
-        )
+        kinds = (("outputs", self.outputs), ("inputs", self.inputs), ("known", self.known))
+        parts = (f"{k} {', '.join(map(self.label, names))}" for k, names in kinds if names)
         every = "" if self.dt is None else f", one step every {self.dt:g} {self.dt_unit}".rstrip()
-        return "\n".join((f"{self.steps} steps{every}: {named}", *self.notes))
+        return "\n".join((f"{self.steps} steps{every}: {'; '.join(parts)}", *self.notes))
 
 
 def named(
