@@ -79,7 +79,7 @@ class QPMPC(nn.Module):
             mapping, ``{"H": True, "C": mask}``, a mask is True at the entries that are learned.
         structure: the ties between learned parts of theta. ``"free"``: none, C is any matrix
             (eq:qp5). ``"tied"``: a linear MPC scheme (eq:q1), with one A, B, D and one entry
-            of b, q, lb, ub and w for all stages, where the bounds of hard rows are known limits
+            of b, q, lb, ub and w for all stages. In both, the bounds of hard rows are known limits
             (eq:v1c3), and are not learned.
         step: the rule that keeps H and H_f positive semidefinite and w non-negative (eq:sdp1).
             ``"cholesky"``: theta is a factor of them. ``"projection"`` and ``"sdp"``: theta is H
@@ -696,7 +696,7 @@ class QPMPC(nn.Module):
 
     def _parametrizations_for(self, name: str, value: Tensor) -> list[nn.Module]:
         mask = self._masks.get(name)
-        if self.structure != "free" and name in ("lb", "ub"):
+        if name in ("lb", "ub"):  # hard bounds, as of actuators, stay
             soft = self.soft.cpu()
             mask = soft if mask is None else mask & soft
         options = (self.layout, self.structure, self.hessian, self.step, mask)
