@@ -143,18 +143,21 @@ def draw_known(mpc: Any, count: int, seed: int = 0) -> np.ndarray:
     return rng.standard_normal((count, mpc.n_p)) * 10 ** rng.uniform(-2, 1.5, (count, 1))
 
 
-def load(
-    mpc: Any, folder: Path, flags: tuple[str, ...] = ("-O0",), **settings: Any
-) -> tuple[Library, Tables]:
-    """Write and compile the tables of a QP, without a comparison."""
+def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[Library, Tables]:
+    """Compile the tables of a QP, without a comparison."""
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.rows) + AT_LEAST
     chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
     origin = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0)
     nothing = Examples([origin], np.zeros(tables.n_u), 0.0)
-    for name, text in sources(tables, chosen, "", nothing).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    return Library(folder, "policy", chosen.dtype, (*flags, "-std=c99", "-fPIC", "-shared")), tables
+    texts, flags = sources(tables, chosen, "", nothing), (*flags, "-std=c99", "-fPIC", "-shared")
+    return Library(texts, "policy", chosen.dtype, flags), tables
+
+
+def read(folder: Path, name: str = "policy", dtype: str = "float64") -> Library:
+    """Compile the files of an export."""
+    texts = {f"{name}.{end}": (folder / f"{name}.{end}").read_text() for end in "hc"}
+    return Library(texts, name, dtype)
 
 
 def compilers() -> dict[str, list[str]]:

@@ -32,10 +32,10 @@ BUDGET = {
     "control": 4824,  # nonlinear plants
     "envs": 1427,
     "experiment": 2886,
-    "export": 1487,
+    "export": 1482,
     "learning": 2832,  # models that did not train theta decide in improve
     "identification": 2641,
-    "mpc": 3866,
+    "mpc": 3857,
     "proofs": 1001,
     "qp": 5298,
     "study": 586,  # load_run(..).predict, which refinement's second start pays for

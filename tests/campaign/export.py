@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from tests.campaign.exports import PROBLEMS
+from tests.exported import read
 from torch_qpmpc import export_c
 from torch_qpmpc.export.comparison import actions, reference
-from torch_qpmpc.export.library import Library
 from torch_qpmpc.qp.program import Status as Outcome
 from torch_qpmpc.study.markdown import table, write_section
 
@@ -60,7 +60,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
     p = rng.permutation(p)
     with tempfile.TemporaryDirectory() as folder:
         export = export_c(mpc, folder, storage=storage)
-        library = Library(Path(folder), "policy", "float64")
+        library = read(Path(folder))
         size = object_size(Path(folder))
     counts, wrong, worst = np.zeros(3, dtype=int), 0, np.zeros(2)
     warm = library.states(1)

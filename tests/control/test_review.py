@@ -138,7 +138,8 @@ def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
     assert noise is not None
     assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
     held = 1 + (0.9 * 0.02) ** 2 / (1 - 0.9**2)
-    assert linear.cost_of_noise(mpc.design, noise, active=False) == pytest.approx(held)
+    held_loop = LinearLoop.of(mpc, looped.observer, 0.0)
+    assert held_loop.cost_of_noise(mpc.design, noise) == pytest.approx(held)
 
 
 def test_a_filter_that_takes_noise_for_disturbances_is_named_and_its_remedy_mends_it():

@@ -171,8 +171,6 @@ def test_the_compiler_is_the_first_of_cc_gcc_clang_and_ziglang(monkeypatch):
 
 
 @needs_compiler
-def test_an_error_of_the_compiler_is_named(tmp_path):
-    (tmp_path / "policy.c").write_text("int x = ;\n")
-    (tmp_path / "policy.h").write_text("")
+def test_an_error_of_the_compiler_is_named():
     with pytest.raises(QPError, match=r"(?s)compiler: got an error of .*expected a compiled"):
-        library.Library(tmp_path, "policy", "float64")
+        library.Library({"policy.c": "int x = ;\n", "policy.h": ""}, "policy", "float64")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
-from tests.exported import SCHEMES, house, rates, tied
+from tests.exported import SCHEMES, house, rates, read, tied
 from tests.refused import refused
 from torch_qpmpc import QPMPC, QPError, Status, export_c
 from torch_qpmpc.export import comparison
@@ -39,7 +39,7 @@ def test_the_report_has_sizes_and_agreement(options, tmp_path):
     assert (agreement.states, agreement.solved, agreement.infeasible) == (40, 40, 0)
     assert "where solved (40); 0 infeasible, 0 unsolved" in str(export)
     assert 20 < agreement.iterations < export.max_iterations == 1300
-    assert export.state_bytes == Library(tmp_path / "deep/folder", "mass", "float64").state_bytes
+    assert export.state_bytes == read(tmp_path / "deep/folder", "mass").state_bytes
     assert f"state {export.state_bytes:,} bytes" in str(export)
     assert "at 40 states: actions within" in str(export)
 
@@ -57,7 +57,7 @@ def test_float32_is_measured(tmp_path):
     assert export.agreement is not None
     assert 1e-8 < export.agreement.u < 1e-3
     assert "typedef float single_real;" in export.files[0].read_text()
-    library = Library(tmp_path, "single", "float32")
+    library = read(tmp_path, "single", "float32")
     assert library.state_bytes == export.state_bytes
 
 
@@ -309,7 +309,7 @@ def test_the_self_test_fails_for_other_tables(tmp_path):
     text = source.read_text()
     start = text.index("U_OFFSET[1] =") + len("U_OFFSET[1] =\n")
     source.write_text(f"{text[:start]}{{0.5}};{text[text.index(';', start) + 1 :]}")
-    assert Library(header.parent, "policy", "float64").selftest() == 1
+    assert read(header.parent).selftest() == 1
 
 
 @needs_compiler

@@ -31,9 +31,9 @@ SEEDS = (2, 7, 13, 21, 35, 350)
 COMPILERS = compilers()
 
 
-def check(mpc, folder, count=200, seed=0, **settings):
+def check(mpc, count=200, seed=0, **settings):
     """Compare cold steps and one controller's steps with exact solutions."""
-    library, tables = load(mpc, folder, **settings)
+    library, tables = load(mpc, **settings)
     p = draw_known(mpc, count, seed)
     cold = library.steps(library.states(count), p, tables.n_u)
     state = library.states(1)
@@ -55,29 +55,29 @@ def check(mpc, folder, count=200, seed=0, **settings):
 @pytest.mark.parametrize(
     ("name", "storage"), [*zip(SCHEMES, itertools.cycle(("fast", "small")), strict=False)]
 )
-def test_a_scheme_agrees_with_an_exact_solver(name, storage, tmp_path):
-    check(SCHEMES[name](), tmp_path, storage=storage)
+def test_a_scheme_agrees_with_an_exact_solver(name, storage):
+    check(SCHEMES[name](), storage=storage)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_rows_of_every_kind_agree_with_an_exact_solver(seed, tmp_path):
-    check(random_qp(seed), tmp_path, 150, storage=("fast", "small")[seed % 2])
+def test_rows_of_every_kind_agree_with_an_exact_solver(seed):
+    check(random_qp(seed), 150, storage=("fast", "small")[seed % 2])
 
 
-def test_hard_rows_that_no_plan_satisfies_are_infeasible(tmp_path):
-    cold, codes = check(tied(4, state_slack=torch.inf), tmp_path)
+def test_hard_rows_that_no_plan_satisfies_are_infeasible():
+    cold, codes = check(tied(4, state_slack=torch.inf))
     assert {SOLVED, INFEASIBLE} == {*codes}
     assert (cold.violation[codes == INFEASIBLE] > 1e-6).all()
     assert (np.abs(cold.u) <= 1).all()
 
 
-def test_a_soft_row_at_its_bound_is_certified_whatever_its_price(tmp_path):
+def test_a_soft_row_at_its_bound_is_certified_whatever_its_price():
     """A price times the rounding of a row is large beside the value."""
     D, most = [[0.0, 0.0, 1.0], [1.0, 0.3, 0.2]], torch.tensor([0.3, 0.7])
     options = {"stage_weight": [1.0, 1.0, 0.1], "constraints": (D, -most, most)}
     A, B = [[0.9, 0.2], [0.0, 0.8]], [[0.1], [1.0]]
     mpc = QPMPC.from_model(A, B, 4, constraint_slack=1e8, **options)
-    library, _ = load(mpc, tmp_path)
+    library, _ = load(mpc)
     p = np.random.default_rng(0).normal(size=(300, 2))
     steps, exact = library.steps(library.states(300), p, 1), reference(mpc, p, "torch")
     assert (steps.codes == SOLVED).all()
@@ -85,7 +85,7 @@ def test_a_soft_row_at_its_bound_is_certified_whatever_its_price(tmp_path):
     np.testing.assert_allclose(steps.value, exact.value, rtol=1e-6)
 
 
-def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost(tmp_path):
+def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost():
     def scheme(slack: float) -> QPMPC:
         bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": slack}
         weight = [1.0, 1.0]
@@ -93,7 +93,7 @@ def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost(tmp_path)
 
     p = np.array([[0.5], [1.0], [1.5]])
     for slack, codes in ((torch.inf, [0, 0, 2]), (3.0, [0, 0, 0])):
-        library, _ = load(mpc := scheme(slack), tmp_path)
+        library, _ = load(mpc := scheme(slack))
         steps = library.steps(library.states(3), p, 1)
         assert [*steps.codes] == codes
         solved = steps.codes == SOLVED
@@ -103,7 +103,7 @@ def test_a_known_hard_row_decides_feasibility_and_a_soft_one_is_a_cost(tmp_path)
 
 
 @pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
-def test_a_row_of_p_alone_is_judged_by_its_own_terms(length, tmp_path):
+def test_a_row_of_p_alone_is_judged_by_its_own_terms(length):
     """As the QP layer judges it: see tests/qp/pipeline/test_certificate.py."""
     G = np.array([[length, 0.0]])
     bounds = {"constraints": (G, [-torch.inf], [0.5 * length]), "constraint_slack": torch.inf}
@@ -111,15 +111,15 @@ def test_a_row_of_p_alone_is_judged_by_its_own_terms(length, tmp_path):
         [[0.1]], [[1.0]], 1, stage_weight=[1.0, 1.0], on_failure="mask", **bounds
     )
     p = 0.5 * (1 + np.array([[3e-8], [3e-5]]))
-    library, _ = load(mpc, tmp_path)
+    library, _ = load(mpc)
     assert [*library.steps(library.states(2), p, 1).codes] == [SOLVED, INFEASIBLE]
     assert mpc.solve(torch.as_tensor(p)).solved.tolist() == [True, False]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
-def test_an_invalid_p_holds_the_last_action(bad, tmp_path):
+def test_an_invalid_p_holds_the_last_action(bad):
     mpc = rates()
-    library, _ = load(mpc, tmp_path)
+    library, _ = load(mpc)
     state = library.states(1)
     p = np.zeros((1, mpc.n_p))
     assert [*library.steps(state, p + bad, 1).u[0]] == [0.0]
@@ -137,7 +137,7 @@ def test_an_invalid_p_holds_the_last_action(bad, tmp_path):
 
 def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_path):
     mpc = SCHEMES["point mass"]()
-    library, _ = load(mpc, tmp_path, max_iterations=3)
+    library, _ = load(mpc, max_iterations=3)
     p = np.array([[2.1, -2.0, 4.0, -5.0]])
     state, codes = library.states(1), []
     for _ in range(60):
@@ -153,9 +153,9 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
     export_c(mpc, tmp_path, max_iterations=3)  # its self-test leaves out states beyond the limit
 
 
-def test_a_qp_without_rows_has_a_linear_policy(tmp_path):
+def test_a_qp_without_rows_has_a_linear_policy():
     mpc = drawn_mpc(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
-    library, tables = load(mpc, tmp_path, flags=("-O2", *STRICT))
+    library, tables = load(mpc, flags=("-O2", *STRICT))
     assert len(tables.rows) == 0
     p = draw_known(mpc, 50)
     steps = library.steps(library.states(50), p, 1)

@@ -119,8 +119,8 @@ class Design:
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
         inputs = self.plant.inputs
-        levels = [*map(self.levels.get, inputs)]
-        bounds = hull("u_bounds", self.u_bounds, levels, inputs, self.du_bounds)
+        own = [*map(self.levels.get, inputs)]
+        bounds = hull("u_bounds", self.u_bounds, own, inputs, self.du_bounds)
         object.__setattr__(self, "u_bounds", bounds)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
@@ -277,7 +277,8 @@ class Design:
         names = *self.plant.outputs, *inputs, *(f"move of {name}" for name in inputs)
         sides = np.hstack((self.y_bounds, self.u_bounds, self.du_bounds))
         of = np.pad(np.hstack(self.limited), ((0, 0), (0, m)), constant_values=-1)
-        fixed, (side, i) = np.flatnonzero(np.isfinite(sides).any(0)), np.nonzero(of >= 0)
+        fixed = np.flatnonzero(np.isfinite(sides).any(0))
+        side, i = np.nonzero(of >= 0)
         j, places = of[side, i], np.append(fixed, i)
         lower, upper = (
             np.append(part[fixed], np.where(side == k, self.nominal[j], limit))
@@ -285,7 +286,8 @@ class Design:
         )
         low, high = np.pad(self.margins, ((0, 0), (0, 2 * m)))[:, places]
         price = np.append(self.slack, np.full(2 * m, np.inf))[places]
-        kinds, unit = np.repeat([0, 1, 2], (n_y, m, m))[places], np.eye(len(names))[places]
+        kinds = np.repeat([0, 1, 2], (n_y, m, m))[places]
+        unit = np.eye(len(names))[places]
         K = np.pad(np.eye(n_d)[j], ((len(fixed), 0), (0, 0)))
         parts = np.array(["y_bounds", "u_bounds", "du_bounds"])[kinds], np.array(names)[places]
         parts = *parts, unit[:, : n_y + m], unit[:, n_y + m :], K, lower + low, upper - high, price
@@ -427,7 +429,8 @@ class Design:
         batch, constants = x.shape[:-1], arrays.asarray(np.append(self.nominal, [0.0, 1.0]))
         constants = arrays.broadcast_to(constants, (*batch, len(constants))) if batch else constants
         parts = [part.reshape(*batch, -1) for part in (x, *target, u_last, known, constants)]
-        signals, (plus, minus) = arrays.concatenate(parts, -1), map(arrays.asarray, self.taken)
+        signals = arrays.concatenate(parts, -1)
+        plus, minus = map(arrays.asarray, self.taken)
         return signals[..., plus] - signals[..., minus]
 
     @cached_property

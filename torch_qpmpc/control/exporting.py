@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,11 +21,11 @@ from torch_qpmpc.control.observer import STEADY
 from torch_qpmpc.control.simulation import centre, closed_loop, last_known
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError, SolverError
-from torch_qpmpc.export.export import Export, check_name, export_c, refuse
+from torch_qpmpc.export.export import Export, build, check_name, refuse
 from torch_qpmpc.export.fmu import Variable, write_fmu
-from torch_qpmpc.export.library import FLAGS, compiled, compiler, required_compiler
+from torch_qpmpc.export.library import FLAGS, compiled, compiler, required_compiler, written
 from torch_qpmpc.export.tables import make_tables
-from torch_qpmpc.export.writer import CONSTANTS, array, comment, filled, integers
+from torch_qpmpc.export.writer import CONSTANTS, Settings, array, comment, filled, integers
 
 #: Steps of the loop that is compared, and the most steps that the self-test replays.
 COMPARED, REPLAYED = 200, 10
@@ -120,18 +119,35 @@ class CompiledController:
 
 
 def export_controller(
-    law: Law, memory: Memory, folder: str | Path, name: str, missing: bool = False, **options: Any
+    law: Law, memory: Memory, folder: str | Path, name: str, **options: Any
 ) -> ControllerExport:
     """Write a controller as C; see `Controller.export_c`."""
+    report, texts = _build(law, memory, name, **options)
+    return replace(report, files=written(folder, texts))
+
+
+def export_controller_fmu(
+    law: Law, memory: Memory, path: str | Path, name: str, **options: Any
+) -> ControllerExport:
+    """Write a controller as an FMU; see `Controller.export_fmu`."""
+    required_compiler()
+    report, texts = _build(law, memory, name, missing=True, **options)
+    file = write_fmu(path, name, texts, _variables(law, memory), law.design.plant.dt or 1.0)
+    return replace(report, files=(file,))
+
+
+def _build(
+    law: Law, memory: Memory, name: str, missing: bool = False, **options: Any
+) -> tuple[ControllerExport, dict[str, str]]:
+    """Return a report without files, and the texts by file name."""
     law.design.plant.check_linear("C and FMUs")
     check_name(name)
-    dtype = options.get("dtype", "float64")
-    mpc, known = law.mpc, last_known(law.design, memory)
-    with tempfile.TemporaryDirectory() as temporary:
-        plan = export_c(mpc.plan, temporary, name=f"{name}_plan", **options)
-        target = export_c(mpc.targets, temporary, name=f"{name}_target", **options)
-        texts = {x.name: x.read_text("utf-8") for x in (*plan.files, *target.files)}
-    course = _course(law, known)
+    mpc, settings = law.mpc, Settings(f"{name}_plan", **options)
+    dtype = settings.dtype
+    plan, texts, _ = build(mpc.plan, settings)
+    target, own, _ = build(mpc.targets, settings._replace(name=f"{name}_target"))
+    texts |= own
+    course = _course(law, last_known(law.design, memory))
     start = course["u"]
     loop = _run(law, course, law.policy(law.begun(start)), COMPARED)
     texts |= _sources(law, name, dtype, loop, missing)
@@ -150,28 +166,11 @@ def export_controller(
         if got:
             refuse(dtype, got, plan)
     texts[f"{name}.h"] = texts[f"{name}.h"].replace("@BYTES@", f"{state_bytes or 'some'}")
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, text in texts.items():
-        (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
-        (folder / file).write_text(text, encoding="utf-8")
     own = sum(x.size for x in _tables(law, dtype, missing).values()) * np.dtype(dtype).itemsize
     own += plan.table_bytes + target.table_bytes
-    files = tuple(map(folder.joinpath, texts))
     most = None if difference is None else float(difference.max())
-    return ControllerExport(files, plan, target, own, state_bytes, len(loop.u), most, missing)
-
-
-def export_controller_fmu(
-    law: Law, memory: Memory, path: str | Path, name: str, **options: Any
-) -> ControllerExport:
-    """Write a controller as an FMU; see `Controller.export_fmu`."""
-    required_compiler()
-    with tempfile.TemporaryDirectory() as folder:
-        report = export_controller(law, memory, folder, name, missing=True, **options)
-        texts = {file.name: file.read_text(encoding="utf-8") for file in report.files}
-    file = write_fmu(path, name, texts, _variables(law, memory), law.design.plant.dt or 1.0)
-    return replace(report, files=(file,))
+    parts = plan, target, own, state_bytes, len(loop.u), most, missing
+    return ControllerExport((), *parts), texts
 
 
 def _variables(law: Law, memory: Memory) -> list[Variable]:
@@ -358,7 +357,8 @@ def _pulls(mpc: LinearMPC) -> dict[str, Array]:
 def _moves(mpc: LinearMPC, dtype: str) -> Array:
     """Return the plan's bounds of the first move, ``(2, m)``, with room for rounding."""
     design, bands, qp = mpc.design, mpc.design.bands, mpc.plan.quadratic_program()
-    bounds, own = np.outer([-np.inf, np.inf], np.ones(len(design.R))), np.asarray(bands.D.any(1))
+    bounds = np.outer([-np.inf, np.inf], np.ones(len(design.R)))
+    own = np.asarray(bands.D.any(1))
     first = len(qp.lb) - len(design.ends.W) - mpc.horizon * len(own)
     sides = (side[first:][: len(own)].detach().double().cpu().numpy() for side in (qp.lb, qp.ub))
     bounds[:, np.nonzero(bands.D)[1]] = [side[own] for side in sides]

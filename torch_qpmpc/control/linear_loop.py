@@ -38,9 +38,9 @@ class LinearLoop:
     units: Array
 
     @classmethod
-    def of(cls, mpc: LinearMPC, observer: Observer) -> LinearLoop:
-        """Return the loop of an MPC, whose cost is positive definite, and an observer."""
-        K_e, K_u, K_r = _gains(mpc)
+    def of(cls, mpc: LinearMPC, observer: Observer, share: float = 1.0) -> LinearLoop:
+        """Return the loop of an MPC, with a ``share`` of its gains, and an observer."""
+        K_e, K_u, K_r = (share * K for K in _gains(mpc))
         plant, F, G, L = mpc.design.plant, observer.F, observer.G, observer.L
         m, corrected = plant.B.shape[1], np.eye(len(F)) - L @ observer.H
         # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
@@ -65,28 +65,20 @@ class LinearLoop:
         m = self.B.shape[1] - 2 * n_y
         return self.plant[2] @ x + np.hstack((np.zeros((n_y, m)), np.eye(n_y), -np.eye(n_y)))
 
-    def cost_of_noise(
-        self, design: Design, noise: tuple[Array, Array], active: bool = True
-    ) -> float:
-        """Return the mean cost of a step under a model's noise; if not ``active``, of u = 0.
-
-        It is inf if the plant or the loop has no steady state.
-        """
+    def cost_of_noise(self, design: Design, noise: tuple[Array, Array]) -> float:
+        """Return the mean cost of a step under a model's noise, inf without a steady state."""
         (_, _, C_c, D_c), (A, _, C), (L, S) = self.controller, self.plant, noise
         (n_y, n), m = C.shape, self.B.shape[1] - 2 * len(C)
-        N, moves = A @ L, (np.zeros((m, n)), np.zeros((m, n_y)))
-        of_x, last = C, np.zeros((m, n))
-        if active:
-            A, N = self.A, self.B[:, m : m + n_y] + np.pad(N, ((0, len(self.A) - n), (0, 0)))
-            moves = np.hstack((D_c @ C, C_c)), D_c
-            of_x, last = np.pad(C, ((0, 0), (0, len(A) - n))), np.eye(m, len(A), len(A) - m)
-        if not np.abs(np.linalg.eigvals(A)).max() < 1:
+        if not self.radius < 1:
             return np.inf
-        X = N @ S @ N.T
+        others = 0, len(self.A) - n
+        N = self.B[:, m : m + n_y] + np.pad(A @ L, (others, (0, 0)))
+        A, X = self.A, N @ S @ N.T
         for _ in range(DOUBLINGS):
             X, A = X + A @ X @ A.T, A @ A
-        changes = moves[0] - last, moves[1]
-        parts = (design.Q, of_x, np.eye(n_y)), (design.R, *moves), (design.dR, *changes)
+        y, u = np.pad(C, ((0, 0), others)), np.hstack((D_c @ C, C_c))
+        last = np.eye(m, len(A), len(A) - m)
+        parts = (design.Q, y, np.eye(n_y)), (design.R, u, D_c), (design.dR, u - last, D_c)
         return float(sum(np.sum(W * (M @ X @ M.T + D @ S @ D.T)) for W, M, D in parts))
 
     def modulus_margin(self) -> float:

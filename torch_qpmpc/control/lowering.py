@@ -100,7 +100,8 @@ def _cost(design: Design, layout: Layout) -> Cost:
     one = places["one"].start
     stage[one, one] = 2 * SCALE * design.typical
     size = places["u"].start
-    P, x, off = riccati(design), np.vstack((s["x"], s["u_last"]))[:, :size], off[:, :size]
+    P, off = riccati(design), off[:, :size]
+    x = np.vstack((s["x"], s["u_last"]))[:, :size]
     if P is None:
         terminal = _squares(y[:, :size], design.Q)
     else:
@@ -130,7 +131,8 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     free = scipy.linalg.null_space(still, rcond=RANK)
     slope = slope - free @ np.linalg.pinv(B.T @ free, rcond=RANK) @ (B.T @ slope)
     slope[np.abs(slope) < RANK * size] = 0.0  # rounding would set the lengths of the QP
-    L, sizes = np.pad(slope, ((0, len(P) - len(A)), (0, 0))), np.concatenate((of_x, of_u))[: len(P)]
+    L = np.pad(slope, ((0, len(P) - len(A)), (0, 0)))
+    sizes = np.concatenate((of_x, of_u))[: len(P)]
     values, V = np.linalg.eigh(P * np.outer(sizes, sizes))
     own = V.T @ L / np.sqrt(np.maximum(values, TINY * values[-1]))[:, None]
     of_r = of_y[of_r]
@@ -192,7 +194,8 @@ def _bounds(design: Design) -> Bounds:
     if design.moves:
         D += bands.D @ (s["u"] - s["u_last"])
     last = (ends.W @ signals - ends.K @ s["known"])[:, :size]
-    first, of_u = (bands.arguments == "y_bounds").sum(), np.isfinite(design.u_bounds).any(0)
+    first = (bands.arguments == "y_bounds").sum()
+    of_u = np.isfinite(design.u_bounds).any(0)
     levels = [*map(design.levels.get, design.plant.inputs)] if design.levels else None
     held = D[:, size:].any(-1) & ~D[:, : design.places["known"].stop].any(-1)
     return Bounds(
@@ -254,7 +257,8 @@ def target_mpc(design: Design) -> QPMPC:
     sizes, n_d = design.scaling, design.plant.sizes[3]
     error[:, :n_r] = 0.0
     K, bands = np.eye(n_d, error.shape[1], n_x - 1 - n_d), design.bands
-    D, of_y = bands.W @ np.vstack((error, inputs)) - bands.K @ K, bands.W[:, :n_y].any(1)
+    D = bands.W @ np.vstack((error, inputs)) - bands.K @ K
+    of_y = bands.W[:, :n_y].any(1)
     moved = np.asarray(D[:, n_x:].any(-1))
     order = np.argsort(design.inner, kind="stable")
     order = order[moved[order]]

@@ -80,8 +80,8 @@ class Observer(NamedTuple):
         Raises:
             QPError: its shape is wrong, or errors of the estimates do not decay with it.
         """
-        L, shape = np.array(gain(self.F, self.H) if callable(gain) else gain, float), self.L.shape
-        if L.shape != shape or not np.isfinite(L).all():
+        L = np.array(gain(self.F, self.H) if callable(gain) else gain, float)
+        if L.shape != (shape := self.L.shape) or not np.isfinite(L).all():
             raise QPError.expected("gain", f"shape {L.shape}, or NaN", f"finite numbers of {shape}")
         radius = np.abs(np.linalg.eigvals(self.F - self.F @ L @ self.H)).max()
         if radius >= 1 - ON_CIRCLE:

@@ -316,8 +316,9 @@ def _reach(design: Design, w: Array, known: Array) -> Array:
     """
     bands, n_y, steady = design.bands, len(design.Q), design.steady
     loads = np.concatenate((w, known, [1.0]))
-    S, rest = bands.W @ np.vstack((steady.Y, steady.U)), bands.W @ np.vstack((steady.y, steady.u))
-    (lower, upper), rest = bands.at(known - design.nominal), rest @ loads
+    S = bands.W @ np.vstack((steady.Y, steady.U))
+    rest = bands.W @ np.vstack((steady.y, steady.u)) @ loads
+    lower, upper = bands.at(known - design.nominal)
     size = np.tile(bands.sizes(design.scaling.y, design.scaling.u), 2)
     rows = np.vstack((S, -S)) / size[:, None]
     limits = np.concatenate((upper - rest, rest - lower)) / size
@@ -361,7 +362,7 @@ def _margin(loop: LinearLoop, law: Law) -> Finding:
 def _noise(loop: LinearLoop, law: Law, noise: tuple[Array, Array]) -> Finding:
     """Under the identified noise the loop costs hardly more than a constant input does."""
     design, cost = law.design, loop.cost_of_noise(law.design, noise)
-    nothing = loop.cost_of_noise(design, noise, active=False)
+    nothing = LinearLoop.of(law.mpc, law.observer, 0.0).cost_of_noise(design, noise)
     ok = bool(cost <= NOISY * nothing + OFFSET * design.typical)
     text = f"Under the log's noise a step costs {cost:.4g}, and {nothing:.4g} with constant inputs."
     remedy = _slower("drift", design.disturbances.names, law.drift / 10)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
@@ -16,7 +14,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_choice, check_kind, check_tensor, check_whole, ungraded
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.comparison import Agreement, choose, compare, states
-from torch_qpmpc.export.library import Library, Steps, compiler, required_compiler
+from torch_qpmpc.export.library import Library, Steps, compiler, required_compiler, written
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import NEAR, REAL, Settings, header, sources, table_bytes
 from torch_qpmpc.mpc.module import QPMPC
@@ -123,19 +121,12 @@ def export_c(
         QPError: an argument is invalid, the cost is singular on the plan, no state has a solution,
             or the self-test fails.
     """
-    settings = Settings(name, dtype, storage, max_iterations)
-    with tempfile.TemporaryDirectory() as temporary:
-        export, _ = _build(mpc, Path(temporary), settings)
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in export.files:
-            (folder / file.name).unlink(missing_ok=True)  # may be a link, which copy would follow
-        copies = (Path(shutil.copy(file, folder)) for file in export.files)
-        return replace(export, files=tuple(copies))
+    export, texts, _ = build(mpc, Settings(name, dtype, storage, max_iterations))
+    return replace(export, files=written(folder, texts))
 
 
-def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Library | None]:
-    """Write, compile and check a policy in an existing folder."""
+def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Library | None]:
+    """Return a report without files, the texts by file name, and the functions with a compiler."""
     name, dtype, storage, limit = settings
     _check(mpc, settings)
     tables = make_tables(mpc)
@@ -143,11 +134,9 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
     p, exact = states(mpc, tables, dtype)
     examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings), examples)
-    for file, text in texts.items():
-        (folder / file).write_text(text, encoding="utf-8")
     library, agreement = None, None
     if compiler() is not None:
-        library = Library(folder, name, dtype)
+        library = Library(texts, name, dtype)
         agreement, error = compare(mpc, tables, library, p, exact)
         solvable, unsolved = agreement.solved + agreement.unsolved, agreement.unsolved
         if limit is None and unsolved > UNSOLVED * solvable:
@@ -165,12 +154,11 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
         remedy = "Install one, or export float64."
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
     own = "some" if library is None else str(library.state_bytes)
-    for file, text in texts.items():
-        (folder / file).write_text(text.replace("@BYTES@", own), encoding="utf-8")
+    texts = {file: text.replace("@BYTES@", own) for file, text in texts.items()}
     sizes = {"n_p": tables.n_p, "n_u": tables.n_u, "rows": len(tables.rows)}
     sizes |= {"variables": tables.R.shape[1], "table_bytes": table_bytes(tables, settings)}
     export = Export(
-        files=tuple(folder / file for file in texts),
+        files=(),
         dtype=dtype,
         storage=storage,
         max_iterations=settings.max_iterations or 0,
@@ -180,7 +168,7 @@ def _build(mpc: QPMPC, folder: Path, settings: Settings) -> tuple[Export, Librar
         digest=tables.digest,
         **sizes,
     )
-    return export, library
+    return export, texts, library
 
 
 def refuse(dtype: str, got: str, of: Tables | Export) -> NoReturn:
@@ -248,8 +236,7 @@ class CompiledPolicy:
     ) -> None:
         required_compiler()
         settings = Settings("policy", dtype, storage, max_iterations)
-        with tempfile.TemporaryDirectory() as folder:
-            self.export, library = _build(mpc, Path(folder), settings)
+        self.export, _, library = build(mpc, settings)
         assert library is not None
         self._library = library
         self._n_p, self._n_u, self._raises = mpc.n_p, mpc.n_u, mpc.on_failure == "raise"

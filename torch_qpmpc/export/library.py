@@ -85,16 +85,16 @@ class Library:
     Its copies share the functions; a pickle has the source, and is compiled when it is loaded.
     """
 
-    def __init__(self, folder: Path, name: str, dtype: str, flags: Sequence[str] = ()) -> None:
-        names = (f"{name}.h", f"{name}.c")
-        files = {file: (folder / file).read_text(encoding="utf-8") for file in names}
+    def __init__(
+        self, files: Mapping[str, str], name: str, dtype: str, flags: Sequence[str] = ()
+    ) -> None:
         self._made_of = files, name, dtype, tuple(flags or FLAGS)
         self._load()
 
     def _load(self) -> None:
         files, name, dtype, flags = self._made_of
         self.real = np.dtype(dtype)
-        library = compiled(files | {"wrapper_.c": filled("wrapper.c", name)}, flags)
+        library = compiled({**files, "wrapper_.c": filled("wrapper.c", name)}, flags)
         self._steps = library[f"{name}_steps"]
         self._resets = library[f"{name}_resets"]
         self.selftest = library[f"{name}_selftest"]
@@ -139,17 +139,25 @@ class Library:
         return Steps(u, codes, *(info[name] for name in self._info.names or ()))
 
 
+def written(folder: str | Path, files: Mapping[str, str]) -> tuple[Path, ...]:
+    """Write texts by file name into a folder, which may be new; return the paths."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, text in files.items():
+        (folder / file).unlink(missing_ok=True)  # may be a link, which would be followed
+        (folder / file).write_text(text, encoding="utf-8")
+    return tuple(map(folder.joinpath, files))
+
+
 def built(files: Mapping[str, str], flags: Sequence[str], target: Path) -> Path:
     """Compile files as C, also with a compiler of C++, into the library ``target``.
 
     Raises:
         QPError: there is no compiler, or it fails.
     """
-    command, folder = required_compiler(), target.parent
-    for file, text in files.items():
-        (folder / file).write_text(text, encoding="utf-8")
-    sources = [str(folder / file) for file in files if file.endswith(".c")]
-    line = [*command, *flags, f"-I{folder}", "-o", str(target), "-x", "c", *sources]
+    command, paths = required_compiler(), written(target.parent, files)
+    sources = [str(path) for path in paths if path.suffix == ".c"]
+    line = [*command, *flags, f"-I{target.parent}", "-o", str(target), "-x", "c", *sources]
     try:
         ended = subprocess.run(line, capture_output=True, text=True, check=False)
     except OSError as error:

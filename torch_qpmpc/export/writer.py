@@ -71,9 +71,9 @@ class Settings(NamedTuple):
     """Choices of `export_c`."""
 
     name: str
-    dtype: str
-    storage: str
-    max_iterations: int | None
+    dtype: str = "float64"
+    storage: str = "fast"
+    max_iterations: int | None = None
 
 
 def sources(tables: Tables, settings: Settings, header: str, examples: Examples) -> dict[str, str]:

@@ -156,8 +156,7 @@ class Levels:
         if self.entries is not None:  # a level to the last bit
             z[..., self.entries] = level.to(z).where(at >= 0, z[..., self.entries])
         gap = gaps.to(qp.q.dtype).where(capped, 0.0) / value.detach().abs().clamp(min=1e-12)
-        errors = solution.value_error + gap
-        other = {"status": status, "value_error": errors, "iterations": nodes}
+        other = {"status": status, "value_error": solution.value_error + gap, "iterations": nodes}
         return replace(solution, qp=best, z=z, value=value, **other)
 
     def within(self, lb: np.ndarray, ub: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -175,10 +174,7 @@ class Levels:
     def search(
         self, programs: Programs, runs: np.ndarray | None = None, hint: np.ndarray | None = None
     ) -> tuple[np.ndarray, ...]:
-        """Return places of the levels, active sets, costs of starts, statuses, nodes and gaps.
-
-        ``runs`` and ``hint`` are those of `plan`, for a batch of one.
-        """
+        """Return places of the levels, active sets, costs of starts, statuses, nodes and gaps."""
         n_f, theta, own = programs.n_f, programs.theta, programs.scaled()
         prepared, group, qps = own.prepared, own.group, own.reduced_qps()
         of, least = prepared.reduced(n_f).rows, 0.0
@@ -267,11 +263,7 @@ def read_levels(value: Any, name: str = "action_levels") -> tuple[tuple[float, .
 
 
 def _numbers(name: str, value: Any, n_u: int) -> np.ndarray:
-    """Return a number for each action.
-
-    Raises:
-        QPError: they are not finite numbers >= 0, of minimum times whole ones >= 1, or not n_u.
-    """
+    """Return a finite number >= 0 for each action, of minimum times a whole one >= 1."""
     of_time = np.bool_(name != "start_cost")
     try:
         numbers = np.broadcast_to(np.asarray(value, float), n_u)
