@@ -29,8 +29,9 @@ TOLERANCE, ROUNDING = 1e-13, 4e-15
 DEPENDENT, NOISE = 1e-11, 1e-9
 #: A violation up to this fraction of a row's terms does not prove that no y is feasible.
 FEASIBLE = 1e-8
-#: Proximal steps, of a singular H.
-PROXIMAL_STEPS = 4
+#: Proximal steps, of a singular H; and slopes of the Lagrangian that one more pass reduces to this
+#: fraction of the linear cost, if H is ill-conditioned.
+PROXIMAL_STEPS, EXACT = 4, 1e-14
 #: The most changes of the active set; and the QPs before, one of which is similar.
 MAX_STEPS, NEAR = 2000, 256
 
@@ -46,11 +47,13 @@ def recall(active, group, fixed, dual, theta, reduced, sizes):
     B, (r, d), w = len(fixed), reduced.G.shape[1:], reduced.w
     g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), sizes.spans[0][:0]
     g = g_l_u[:, :d].copy()
-    v, lam, steps = g, np.zeros((B, r)), np.ones(B, np.int64)
+    slope, v, free, steps = g, np.zeros((B, d)), np.zeros((B, r)), np.ones(B, np.int64)
+    lam, last, force = np.zeros((B, r)), np.zeros((B, r)), np.zeros((B, r))
     low, high, weight, y, x = np.empty((5, r))
     sides, held, factor = np.zeros((B, r), np.int64), np.empty(r, np.int64), np.empty((r, r))
-    for step in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 1):
-        v, free = -products(dual.inverse, group, g, spans), -products(dual.rows, group, g, spans)
+    for step in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 2):
+        v -= products(dual.inverse, group, slope, spans)
+        free -= products(dual.rows, group, slope, spans)
         for i in range(B):
             K, unit, i_w, side = dual.K[group[i]], dual.unit[group[i]], i % len(w), sides[i]
             passes = 2
@@ -75,14 +78,15 @@ def recall(active, group, fixed, dual, theta, reduced, sizes):
                 if changes == 1:
                     break
                 steps[i] += changes - 1
-        v -= transposed_products(dual.rows, group, lam, spans)
-        for i in range(B):
-            for j in range(d):
-                g[i, j] = g_l_u[i, j] - dual.shift[group[i]] * v[i, j]
-    for i in range(B):
-        for j in range(r):
-            lam[i, j] /= dual.unit[group[i], j]
-    return recover(v, lam, steps, group, fixed, theta, reduced, sizes, np.int64(0))
+            for j in range(r):
+                last[i, j], force[i, j] = lam[i, j] - last[i, j], lam[i, j] / unit[j]
+        v -= transposed_products(dual.rows, group, last, spans)
+        last[:] = lam
+        slope = g + products(reduced.H, group, v, spans)
+        slope += transposed_products(reduced.G, group, force, spans)
+        if not slope.size or np.abs(slope).max() <= EXACT * np.abs(g).max():
+            break
+    return recover(v, force, steps, group, fixed, theta, reduced, sizes, np.int64(0))
 
 
 @compiled

@@ -150,7 +150,7 @@ def _ways(matrices, group, vectors, spans):
     (M, rows, columns), widest = matrices.shape, 0
     for j in range(len(spans)):
         widest = max(widest, spans[j, 1] - spans[j, 0])
-    short = len(spans) > 0 and (len(vectors) == 1 or widest <= 1)
+    short = len(vectors) == 1 or (len(spans) > 0 and widest <= 1)
     if len(spans) == 0:
         spans = np.zeros((rows, 2), np.int64)
         spans[:, 1] = columns

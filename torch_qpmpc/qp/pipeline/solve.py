@@ -301,7 +301,7 @@ def steps_of(
         partial(_counted, log),
         _recalled,
         partial(_if_few, _diagnosed),
-        *(partial(_eliminated, way) for way in OTHER_ELIMINATIONS),
+        *(partial(_eliminated, way) for way in (*OTHER_ELIMINATIONS, None)),
         refined,
         _diagnosed,
         *(step for other in others for step in (other, refined)),
@@ -377,11 +377,14 @@ def _if_few(step: Step, programs: Programs, best: BatchSolution) -> BatchSolutio
 
 def _eliminated(eliminate: Any, programs: Programs, best: BatchSolution) -> BatchSolution:
     """Solve with another elimination of C z = b, if it applies."""
-    prepared, C = Prepared(programs.theta, programs.prepared.group, programs.n_f), programs.theta.C
-    prepared.elimination = eliminate(C, programs.n_f) if C.size else None
-    if prepared.elimination is None or not np.isfinite(prepared.elimination.T).all():
-        return best
-    other = Programs(prepared, programs.group, programs.fixed)
+    other = programs
+    if eliminate is not None:
+        C = programs.theta.C
+        prepared = Prepared(programs.theta, programs.prepared.group, programs.n_f)
+        prepared.elimination = eliminate(C, programs.n_f) if C.size else None
+        if prepared.elimination is None or not np.isfinite(prepared.elimination.T).all():
+            return best
+        other = Programs(prepared, programs.group, programs.fixed)
     answer, every = backed(BACKENDS["torch"], PASSES)(other, best), np.arange(len(programs))
     for target in (EARLY, MIDDLE, LAST):
         if not answer.status.any():
