@@ -33,11 +33,11 @@ BUDGET = {
     "envs": 1427,
     "experiment": 2886,
     "export": 1482,
-    "learning": 2832,  # models that did not train theta decide in improve
+    "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2641,
     "mpc": 3857,
     "proofs": 1001,
-    "qp": 5298,
+    "qp": 5291,
     "study": 586,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

@@ -86,7 +86,7 @@ def test_loss_and_its_gradients_with_a_preview(delay_value):
         operator.module.named_parameters(), twin.parameters(), strict=True
     ):
         assert expected.grad is not None
-        assert expected.grad.norm() > 0, name
+        assert expected.grad.norm() > 0 or ".ub." in name, name  # no state is at its upper bound
         torch.testing.assert_close(part.grad, expected.grad, msg=name)
     with pytest.raises(QPError, match=r"^preview: got .*, expected one with preview"):
         loss(td.exclude(("next", "preview")))

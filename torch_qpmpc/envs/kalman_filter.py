@@ -177,7 +177,7 @@ class KalmanFilter(Transform):
         if got != want or not y.dtype.is_floating_point:
             got = f"outputs and actions of sizes {got}, {y.dtype}"
             raise QPError.expected("the environment", got, f"real vectors of sizes {want}")
-        x = Unbounded((*y.shape[:-1], len(self.A)), dtype=y.dtype, device=y.device)
+        x = Unbounded(torch.Size([*y.shape[:-1], len(self.A)]), dtype=y.dtype, device=y.device)
         memory, dtype = ([len(self.A)] * 2, self.A.dtype) if self.missing else ([1], torch.int64)
-        memory = Unbounded((*y.shape[:-1], *memory), dtype=dtype, device=y.device)
+        memory = Unbounded(torch.Size([*y.shape[:-1], *memory]), dtype=dtype, device=y.device)
         return {self.estimate_key: x, KEPT: x.clone(), self.memory_key: memory}

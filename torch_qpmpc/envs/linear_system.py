@@ -94,8 +94,7 @@ class LinearSystem(ABC):
 
     #: True if a step clips s+ to its bounds; if False, they are soft and observations unbounded.
     clips_states: ClassVar[bool] = True
-    #: Makes a seed's numbers others than after ``torch.manual_seed``, as exploration draws them.
-    stream: ClassVar[int] = 0x9E3779B9
+    stream: ClassVar[int] = 0x9E3779B9  # keeps noise apart from exploration, of torch's seed
 
     A: Tensor
     B: Tensor

@@ -69,7 +69,8 @@ class VectorisedEnv(EnvBase):
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
 
     def _reals(self, size: int, dtype: torch.dtype | None = None) -> Unbounded:
-        return Unbounded((*self.batch_size, size), dtype=dtype or self.dtype, device=self.device)
+        shape, dtype = torch.Size([*self.batch_size, size]), dtype or self.dtype
+        return Unbounded(shape, dtype=dtype, device=self.device)
 
     def _box(self, low: Tensor, high: Tensor) -> Bounded:
         low, high = (b.to(self.dtype).expand(*self.batch_size, -1).clone() for b in (low, high))

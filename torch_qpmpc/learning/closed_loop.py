@@ -240,8 +240,8 @@ def ensemble(identified: Identified, members: int, seed: int) -> list[Innovation
 def filtered(model: Innovations, log: Sequence[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
     """Return the estimates ``(steps, n)`` of a log, and the innovations that follow them."""
 
-    def both(*parts: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        return zip(model.estimates(*parts)[:, :-1], model.errors(*parts, 1)[:, :, 0], strict=True)
+    def both(y: np.ndarray, u: np.ndarray, d: np.ndarray) -> Iterator[Any]:
+        return zip(model.estimates(y, u, d)[:, :-1], model.errors(y, u, d, 1)[:, :, 0], strict=True)
 
     x, e = zip(*each(model, signals(log), both), strict=True)
     return np.concatenate(x), np.concatenate(e)
