@@ -24,11 +24,10 @@ from torch_qpmpc.identification.ridge import ridge
 
 #: The networks, their width, and the steps, rate and batch of their training.
 COUNT, WIDTH, STEPS, RATE, BATCH = 5, 64, 2500, 3e-3, 128
-#: Hidden units are silu(s x) / s, with s from 1 to one of these, the second for kinks.
-SHARPEST = 1.0, 10.0
+SHARPEST = 1.0, 10.0  # hidden units are silu(s x) / s, with s from 1 to the second for kinks
 #: A network predicts an entry if it leaves less than this share of the linear model's mean square,
-#: the cost of a nonlinear plant also near a tie with the quadratic; and none that the linear model
-#: leaves less of than this share of its variance.
+#: a sharp one if it does of a smooth one's; the cost of a nonlinear plant also near a tie with the
+#: quadratic; and none that the linear model leaves less of than this share of its variance.
 LEFT, TIED, EXACT = 0.9, 1.5, 1e-10
 #: What changes in fewer steps, and then by its own spread, is held, as a set-point is.
 RARE = 0.1
@@ -153,8 +152,9 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
     if wanted.any():
         spread = torch.where(spread > 0, spread, 1.0)
         inputs, outputs = v.float(), ((target - mean) / spread * wanted).float()
-        fits = [_trained(inputs, outputs, sharpest) for sharpest in SHARPEST]
-        layers, error = min(fits, key=lambda fit: fit[1][wanted].log().mean())
+        smooth, sharp = (_trained(inputs, outputs, sharpest) for sharpest in SHARPEST)
+        share = (sharp[1] / smooth[1])[wanted].log().mean().exp()
+        layers, error = sharp if share < LEFT else smooth
         left = torch.where(wanted, error * spread.square() / rest, 1.0)
         most = torch.where(torch.arange(len(left)) < n_x, LEFT, TIED)
         used = wanted * (left < most) * (left < LEFT).any()
