@@ -406,6 +406,8 @@ DESIGNS = ("mean", "Riccati", "moved", "two numbers", "improve", "improve, H", "
 SHOWN = DESIGNS[:-1]
 #: What the designs by gradients learn, besides soft bounds.
 LEARNED = {"improve": ("q",), "improve, H": ("q", "H", "H_f")}
+#: The rows of what they keep.
+KEPT = {"kept, dearer, most": "improve", "the same, H": "improve, H"}
 IMPROVE: Any = {"updates": 60, "steps": STEPS}
 
 
@@ -445,26 +447,29 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
 def shown(rows: Any) -> str:
     """Format the median and the worst J of each design, and how `improve` compares with it.
 
-    The last row has what `improve` kept, and the largest change of J by it.
+    The last rows have what `improve` kept, and the largest change of J by it.
     """
-    marks, cells, last = compared(rows), {}, {}
+    marks, cells, plants = compared(rows), {}, []
     for (plant, size), own in rows.groupby(["plant", "transitions"], sort=False):
         for design, J in own.groupby("design")["J"]:
             mark = marks.get((plant, design, size), "")
             cells[plant, size, design] = f"{J.median():.3g}/{J.max():.3g}{mark}"
-        last[plant, size] = accepts(own, size)
-    lines = [[x, *(cells.get((*key, x), "") for key in last)] for x in rows["design"].unique()]
-    lines.append(["kept, dearer, most", *last.values()])
-    return table(["", *(f"{plant}, {size:,}" for plant, size in last)], lines)
+        plants.append((plant, size))
+        for name, design in KEPT.items():
+            if design in own["design"].to_numpy():
+                cells[plant, size, name] = accepts(own, size, design)
+    names = [x for x in (*rows["design"].unique(), *KEPT) if any(x in key for key in cells)]
+    lines = [[x, *(cells.get((*key, x), "") for key in plants)] for x in names]
+    return table(["", *(f"{plant}, {size:,}" for plant, size in plants)], lines)
 
 
-def accepts(rows: Any, size: int) -> str:
+def accepts(rows: Any, size: int, design: str) -> str:
     """Format how many theta were kept, how many of them cost more, and the largest change of J."""
     own = rows[rows["transitions"] == size].pivot(index="seed", columns="design")
-    kept = own["kept"]["improve"].fillna(value=False).astype(bool)
+    kept = own["kept"][design].fillna(value=False).astype(bool)
     if not kept.any():
         return "0"
-    change = (own["J"]["improve"] / own["J"]["mean"] - 1)[kept]
+    change = (own["J"][design] / own["J"]["mean"] - 1)[kept]
     return f"{kept.sum()}/{(change > 0).sum()}/{change.max():+.1%}"
 
 
