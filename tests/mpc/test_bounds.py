@@ -1,9 +1,7 @@
 """The bounds of a scheme: their rows, and messages."""
 
-import pytest
 import torch
 
-import torch_qpmpc as qm
 from tests.refused import refused
 from torch_qpmpc import Bounds, Layout, Scheme
 
@@ -72,17 +70,3 @@ def test_bad_arguments_are_named(arguments):
 )
 def test_a_scheme_refuses_bounds_of_other_sizes(arguments):
     Scheme(Layout(2, 1, 3), bounds=Bounds(**arguments))
-
-
-@pytest.mark.parametrize("structure", ["free", "tied"])
-def test_learning_does_not_move_the_limits_of_an_actuator(structure):
-    bounds = {"state_bounds": ([-1.0], [1.0]), "state_slack": 5.0, "action_bounds": ([-1.0], [1.0])}
-    options = {"structure": structure, "learn": ("lb", "ub"), "solver": "daqp", **bounds}
-    mpc = qm.QPMPC.from_model([[0.9]], [[0.5]], 3, stage_weight=[1.0, 0.1], **options)
-    optimizer, s = torch.optim.SGD(mpc.parameters(), lr=1e-3), torch.linspace(-3, 3, 9)[:, None]
-    mpc.value(s).sum().backward()
-    optimizer.step()
-    assert mpc.ub[0] > 1 > mpc.lb[0] + 2  # the price of the states pulls their bounds
-    assert mpc.policy(s).abs().max().item() == pytest.approx(1.0)
-    for hard in (mpc.ub[~mpc.soft], -mpc.lb[~mpc.soft]):
-        assert torch.equal(hard, torch.ones(3).double())

@@ -344,8 +344,10 @@ def test_it_stays_a_linear_mpc_scheme_while_it_is_learned(name, second_order):
         assert mpc.C[2 * k : 2 * k + 2].count_nonzero() == row.count_nonzero()
 
 
-def test_no_optimiser_moves_the_bounds_of_hard_rows():
-    mpc = linear(free=0.0)
+@pytest.mark.parametrize("structure", ["free", "tied"])
+def test_no_optimiser_moves_the_bounds_of_hard_rows(structure):
+    """The limits of an actuator, for example."""
+    mpc = linear(free=0.0, structure=structure)
     optimizer = torch.optim.AdamW(mpc.parameters(), lr=0.1, weight_decay=1.0)
     hard = torch.arange(mpc.n_z) % 3 == 2
     before = {name: getattr(mpc, name).detach().clone() for name in ("lb", "ub")}

@@ -22,9 +22,6 @@ SOLUTION = (
     *("active", "status", "residual"),
 )
 OPERANDS = (*EVENT_SHAPES, "fixed")
-#: Row kinds without equalities, whose bounds cannot be changed one at a time.
-SOFT = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
-HARD = ("inside", "at_lower", "at_upper", "no_upper")
 
 
 def solution(*operands: Tensor, **options: Any) -> QPSolution:
@@ -85,31 +82,6 @@ def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
         assert_close(
             operand.grad, weighted, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}"
         )
-
-
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("name", OPERANDS)
-def test_gradient_agrees_with_finite_differences(name, seed):
-    known = known_qp(seed, batch=(3,), soft=SOFT, hard=HARD)
-    operands = operands_of(known)
-    index = OPERANDS.index(name)
-    direction = normal(*operands[index].shape, seed=seed)
-    if name == "H":
-        direction = direction + direction.mT
-    weight = torch.tensor([1.0, -2.0, 0.5]).double()
-
-    def along(step: float) -> Tensor:
-        moved = list(operands)
-        moved[index] = operands[index] + step * direction
-        return value(*moved) @ weight
-
-    operands[index].requires_grad_()
-    (gradient,) = torch.autograd.grad(value(*operands) @ weight, operands[index])
-    operands[index].requires_grad_(False)
-    step = 1e-4
-    central = (along(step) - along(-step)) / (2 * step)
-    assert_close((gradient * direction).sum(), central, rtol=1e-5, atol=1e-5)
-    assert central.abs() > 1e-2
 
 
 @pytest.mark.parametrize("of_action", [False, True])
@@ -237,13 +209,16 @@ def test_a_value_that_is_changed_in_place_keeps_its_gradient():
 # Unsolved elements
 
 
+@pytest.mark.parametrize("part", ["value", "z"])
 @pytest.mark.parametrize("incoming", [1.0, torch.inf, torch.nan])
-def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming):
+def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming, part):
     known = infeasible(known_qp(5, batch=(3,), matrices=(3,)), 1)
     operands = operands_of(known, differentiable=True)
-    values = value(*operands, on_failure="mask")
-    assert values[1] == torch.inf
-    values.backward(torch.tensor([1.0, incoming, 1.0]).double())
+    found = solution(*operands, on_failure="mask")
+    assert found.value[1] == torch.inf
+    outcome = getattr(found, part)
+    weight = torch.tensor([1.0, incoming, 1.0]).double()
+    outcome.backward(weight.reshape(3, *(1,) * (outcome.ndim - 1)).expand_as(outcome))
     for name, operand in zip(OPERANDS, operands, strict=True):
         assert operand.grad is not None
         assert operand.grad.isfinite().all(), name
@@ -327,15 +302,6 @@ def test_shapes_of_the_solution(batch, of_matrices):
     assert found.mu.shape == known.sigma.shape
 
 
-def test_a_constant_cost_of_its_own_makes_a_batch_too():
-    known = known_qp(10)
-    lift = torch.arange(3).double()
-    found = solve_qp(replace(known.qp, c=known.qp.c + lift), known.fixed, solver="daqp")
-    assert_close(found.value, known.value + lift)
-    assert found.z.shape == (3, 12)
-    assert found.status.shape == (3,)
-
-
 def test_multipliers_of_a_row_sum_to_its_weight():
     known = known_qp(11, batch=(4,))
     found = solve_qp(known.qp, known.fixed, solver="daqp")
@@ -371,13 +337,6 @@ def test_an_asymmetry_within_the_tolerance_of_single_precision_does_no_harm():
     assert_close(solve_qp(qp, solver="daqp").z, 100 * unit, rtol=1e-5, atol=0)
 
 
-def test_everything_may_be_fixed():
-    known = known_qp(13, n_c=0, n_f=12, soft=("above", "below", "inside"), hard=("inside",))
-    found = solve_qp(known.qp, known.fixed, solver="daqp")
-    assert_close(found.value, known.value)
-    assert_close(found.z, known.z)
-
-
 # Errors
 
 
@@ -390,9 +349,7 @@ GOOD, OTHER = known_qp(14, batch=(3,)), known_qp(14)
     ({"fixed": torch.tensor(1.0)}, r"fixed: got shape \(\), expected shape \(\*batch, n_f\)"),
     ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
     ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
-    ({"solver": None}, "solver: got None, expected a name"),
     ({"on_failure": None}, "on_failure: got None, expected a name"),
-    ({"solver": "prox"}, r"solver: got 'prox', expected one of .* Did you mean 'proxqp'\?"),
     ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
 )
 def test_bad_arguments_are_named(arguments):

@@ -287,29 +287,23 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("nobody_solves")
-def test_unsolved_qps_are_not_converged():
+def test_unsolved_qps_are_not_converged(recwarn):
     known = known_qp(4, batch=(2, 3))
     message = (
         r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
         r"no solver reached the certificate's tolerance, and the QP is neither"
     )
-    with pytest.raises(SolverError, match=message):
-        solve(known)
-    with pytest.warns(RuntimeWarning, match=message):
-        solve(known, on_failure="warn")
-
-
-@pytest.mark.usefixtures("nobody_solves")
-def test_unsolved_qps_are_masked_on_request(recwarn):
-    known = known_qp(4, batch=(2, 3))
     with SolveLog() as log:
         solution = solve(known, on_failure="mask")
     assert not recwarn
     assert (solution.status == Status.NOT_CONVERGED).all()
     assert (solution.value == torch.inf).all()
     assert (solution.residual > 1e-6).all()
-    assert not solution.solved.any()
     assert (log.solves, log.unsolved) == (6, 6)
+    with pytest.raises(SolverError, match=message):
+        solve(known)
+    with pytest.warns(RuntimeWarning, match=message):
+        solve(known, on_failure="warn")
 
 
 # The log
