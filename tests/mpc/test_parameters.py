@@ -159,7 +159,7 @@ def test_a_copy_has_a_theta_of_its_own():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("batch", [(), (1,), (1, 1)])
+@pytest.mark.parametrize("batch", [(), (1,), (1, 1), (2, 3)])
 def test_the_action_has_the_batch_and_the_dtype_of_the_state(batch, dtype):
     mpc = random_mpc(5)
     s = STATES[0].to(dtype).expand(*batch, 2)
@@ -170,8 +170,11 @@ def test_the_action_has_the_batch_and_the_dtype_of_the_state(batch, dtype):
         assert_close(torch.from_numpy(action), mpc.policy(s).detach(), rtol=1e-4, atol=1e-4)
 
 
-def test_a_state_without_a_solution_has_the_errors_of_a_batch():
-    mpc = drawn_mpc(1, 1, 3, state_bounds=([-1.0], [1.0]), state_slack=torch.inf, solver="daqp")
+@pytest.mark.parametrize("on_failure", ["raise", "mask"])
+def test_a_state_without_a_solution_has_the_errors_of_a_batch(on_failure):
+    """A masked QP's placeholder must not reach a plant."""
+    hard = {"state_bounds": ([-1.0], [1.0]), "state_slack": torch.inf}
+    mpc = drawn_mpc(1, 1, 3, solver="daqp", on_failure=on_failure, **hard)
     assert_predicted(mpc, torch.full((1, 1), 0.1, dtype=torch.float64))
     for _ in range(2):
         with pytest.raises(SolverError, match=r"1 of 1 QPs .* 1 INFEASIBLE"):

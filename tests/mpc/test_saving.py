@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.problems import drawn_mpc
-from torch_qpmpc import QPMPC, QPError, SolverError, files
+from torch_qpmpc import QPMPC, QPError, files
 from torch_qpmpc.qp.solvers import BACKENDS
 
 FOLDER = Path(__file__).parent
@@ -98,16 +98,6 @@ def test_a_file_with_a_backend_that_is_not_registered_says_so(tmp_path, monkeypa
 # Predict
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_it_is_the_policy_as_an_array(dtype, batch):
-    mpc = QPMPC.from_model([[1.0]], [[1.0]], 3, stage_weight=[1.0, 0.1])
-    s = np.linspace(-1, 1, int(np.prod(batch))).reshape(*batch, 1).astype(dtype)
-    action = mpc.predict(s)
-    assert (type(action), action.dtype, action.shape) == (np.ndarray, dtype, (*batch, 1))
-    assert_close(action, mpc.policy(torch.as_tensor(s)).detach().numpy())
-
-
 @pytest.mark.parametrize("observation", [np.ones(3), 1.0, np.ones((2, 1))])
 def test_another_shape_is_an_error(observation):
     with pytest.raises(QPError, match=r"^observation: got shape \(.*\), expected shape \(\*batch"):
@@ -121,19 +111,6 @@ def test_more_than_an_observation_is_an_error(observation):
     )
     with pytest.raises(QPError, match=message):
         drawn_mpc(2, 1, 3).predict(observation)
-
-
-def test_an_unsolved_qp_raises_even_if_it_is_masked():
-    """A placeholder must not reach a plant."""
-    bounds = {
-        "state_bounds": ([-1.0], [1.0]),
-        "state_slack": torch.inf,
-        "action_bounds": ([-1], [1]),
-    }
-    mpc = QPMPC.from_model([[1.0]], [[0.1]], 3, stage_weight=[1, 1], on_failure="mask", **bounds)
-    assert mpc.policy(torch.tensor([5.0])) == 0.0
-    with pytest.raises(SolverError, match="1 of 1 QPs have no certified solution"):
-        mpc.predict([5.0])
 
 
 if __name__ == "__main__":
