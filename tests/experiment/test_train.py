@@ -21,7 +21,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment import metrics as metrics_of_runs
-from torch_qpmpc.experiment.launch import LOCK, locked, same_command
+from torch_qpmpc.experiment.launch import LOCK, same_command
 from torch_qpmpc.experiment.run_folder import read_config, read_metrics
 from torch_qpmpc.files import load_file
 from torch_qpmpc.mpc.layout import Layout, band_distance
@@ -306,13 +306,6 @@ def test_the_sentence_of_a_stopped_run_has_its_command(tmp_path, monkeypatch, ca
     )
     run_command("seed=2", f"hydra.run.dir={tmp_path}")
     assert capsys.readouterr().out == "python train.py seed=2 'hydra.run.dir=my run'\n"
-
-
-def test_a_folder_in_use_is_refused(stopped):
-    before = contents(stopped)
-    with locked(stopped, ""), pytest.raises(SystemExit, match=f"got {stopped}, in use by "):
-        run_command(*TINY, f"hydra.run.dir={stopped}")
-    assert contents(stopped) == before
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own():

@@ -42,66 +42,66 @@ def targets(mpc: QPMPC, size: float = 0.1) -> Tensor:
     return mpc.action_value(s, a).detach() + size * normal(COUNT, seed=2)
 
 
+def assert_steps(
+    optimizer: GaussNewton,
+    reference: Reference,
+    s: Tensor,
+    a: Tensor,
+    target: Tensor,
+    weight: Tensor | None = None,
+    **own: Any,
+) -> None:
+    """Assert that a step is the reference's."""
+    before = reference.theta()
+    expected = reference.step(s, a, target, own.get("penalty"), weight)
+    report = optimizer.step(s, a, target, **own)
+    assert report.accepted
+    assert math.isnan(report.ratio)
+    assert expected.abs().max() > 1e-5
+    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+
+
+def compared(**options: Any) -> tuple[QPMPC, GaussNewton, Reference]:
+    mpc = random_mpc(2, **options)
+    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
+    return mpc, optimizer, Reference(mpc, optimizer)
+
+
 @pytest.mark.parametrize("name", PARTS)
 def test_the_step_is_the_damped_least_squares_step(name):
-    mpc = random_mpc(2, **PARTS[name])
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    reference = Reference(mpc, optimizer)
+    mpc, optimizer, reference = compared(**PARTS[name])
     for size in (0.1, 0.02):
-        (s, a), target, before = pairs(n_p=mpc.n_p), targets(mpc, size), reference.theta()
-        expected = reference.step(s, a, target)
-        report = optimizer.step(s, a, target)
-        assert report.accepted
-        assert math.isnan(report.ratio)
-        assert expected.abs().max() > 1e-5
-        assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+        assert_steps(optimizer, reference, *pairs(n_p=mpc.n_p), targets(mpc, size))
 
 
-@pytest.mark.parametrize("name", ["default", "tied"])
-def test_the_step_is_the_same_with_more_pairs_than_entries_of_theta(name):
-    mpc = random_mpc(2, **PARTS[name])
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    reference, count = Reference(mpc, optimizer), 100
-    before = reference.theta()
-    assert count > len(before)
-    s, a = random_states(count, mpc.n_p, size=0.9), random_states(count, 1, size=0.45, seed=1)
-    target = mpc.action_value(s, a).detach() + 0.1 * normal(count, seed=2)
-    expected = reference.step(s, a, target)
-    optimizer.step(s, a, target)
-    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["C alone", "tied"])
-@pytest.mark.parametrize("given", ["inverse variance", "priorities"])
+@pytest.mark.parametrize("name", ["default", "C alone", "tied"])
+@pytest.mark.parametrize("given", ["none", "inverse variance", "priorities"])
 def test_weights_are_those_of_the_squared_errors(name, given):
-    mpc = random_mpc(2, **PARTS[name])
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    s, a = random_states(40, mpc.n_p, size=0.9), random_states(40, 1, size=0.45, seed=1)
+    """With more pairs than entries of theta, too."""
+    mpc, optimizer, reference = compared(**PARTS[name])
+    count = 100 if given == "none" else 40
+    s, a = random_states(count, mpc.n_p, size=0.9), random_states(count, 1, size=0.45, seed=1)
     value = mpc.action_value(s, a).detach()
-    error = 0.1 * a[:, 0] * normal(40, seed=2)
-    own: Any = {"weighted": True}
-    weight = inverse_variance(s, a, value, error, torch.ones(40).bool())
-    if given == "priorities":
-        own = {"weights": normal(40, seed=3).square()}
+    error = 0.1 * a[:, 0] * normal(count, seed=2)
+    own, weight = {}, None
+    if given == "inverse variance":
+        own = {"weighted": True}
+        weight = inverse_variance(s, a, value, error, torch.ones(count).bool())
+    elif given == "priorities":
+        own = {"weights": normal(count, seed=3).square()}
         weight = own["weights"] / own["weights"].mean()
-    reference = Reference(mpc, optimizer)
-    expected = reference.step(s, a, value + error, weight=weight)
-    assert not torch.allclose(expected, Reference(mpc, optimizer).step(s, a, value + error))
-    before = reference.theta()
-    optimizer.step(s, a, value + error, **own)
-    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+    if weight is None:
+        assert count > len(reference.theta())
+    else:
+        assert weight.max() > 1.1 * weight.min()
+    assert_steps(optimizer, reference, s, a, value + error, weight, **own)
 
 
 @pytest.mark.parametrize("learn", [("H", "c", "C"), ("C", "b")])
 def test_the_si_penalty_is_part_of_the_step(learn):
-    mpc = random_mpc(3, learn=learn)
-    optimizer = GaussNewton(mpc, damping=DAMPING, trust_region=False)
-    reference = Reference(mpc, optimizer)
+    mpc, optimizer, reference = compared(learn=learn)
     S = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    before, target = reference.theta(), targets(mpc)
-    expected = reference.step(*pairs(), target, S)
-    optimizer.step(*pairs(), target, penalty=S)
-    assert_close(reference.theta() - before, expected, rtol=1e-5, atol=1e-9)
+    assert_steps(optimizer, reference, *pairs(), targets(mpc), penalty=S)
 
 
 def test_the_sizes_are_part_of_the_state():
