@@ -567,9 +567,9 @@ def read_switching(u_levels: Any, plant: StateSpace, **rules: Any) -> dict[str, 
         raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
     levels = dict(zip(u_levels, read_levels([*u_levels.values()], "u_levels"), strict=True))
     for name in ("min_on", "min_off", "start_cost"):
-        own = read_vector(name, rules[name], [*levels], DEFAULTS[name]).tolist()
-        own = {**dict.fromkeys(plant.inputs, DEFAULTS[name]), **dict(zip(levels, own, strict=True))}
-        rules[name] = tuple(float(x or 0.0) for x in own.values())
+        numbers = read_vector(name, rules[name], [*levels], DEFAULTS[name])
+        own = dict(zip(levels, map(float, numbers), strict=True))
+        rules[name] = tuple(own.get(x, float(DEFAULTS[name])) for x in plant.inputs)
     return {"levels": {name: own for name, own in levels.items() if own}, "switching": rules}
 
 

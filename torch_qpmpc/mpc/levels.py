@@ -100,12 +100,6 @@ class Levels:
         starts = cost[:, None] * scheme.gamma ** np.arange(S)
         return cls(actions, rows, entries, values, rules, starts, bounds.max_nodes)
 
-    @property
-    def identity(self) -> list[Any]:
-        """What values depend on, as lists."""
-        own = (x.tolist() for x in (self.values, self.rows, self.rules, self.starts))
-        return [*own, self.max_nodes]
-
     def solve(
         self, qp: QuadraticProgram, fixed: Tensor, n_kept: int, solver: str, on_failure: str
     ) -> QPSolution:
@@ -133,14 +127,12 @@ class Levels:
         free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
         at = places.where(torch.from_numpy(free).to(places.device), -1)
         values = torch.from_numpy(self.values).to(qp.lb).expand(*at.shape[:-1], -1)
-        level, sides = values.gather(-1, at.clamp(min=0)), []
-        for side in (qp.lb, qp.ub):
-            side = side.expand(*batch, -1).clone()
+        level, none = values.gather(-1, at.clamp(min=0)), places[..., 0, 0] < 0
+        lb, ub = (side.expand(*batch, -1).clone() for side in (qp.lb, qp.ub))
+        for side in (lb, ub):
             side[..., self.rows] = level.where(at >= 0, side[..., self.rows])
-            sides.append(side)
-        none = places[..., 0, 0] < 0
-        lb = sides[0].masked_fill(none[..., None], torch.inf)  # above ub, where there is no plan
-        best = replace(qp, lb=lb, ub=sides[1], check_values=False)
+        lb[none] = torch.inf  # above ub, where there is no plan
+        best = replace(qp, lb=lb, ub=ub, check_values=False)
         solution = solve(best, fixed, n_kept, solver, "mask", active)
         status = solution.status.where((solution.status != Status.SOLVED) & ~none, ends)
         capped = status == Status.NODE_LIMIT

@@ -35,6 +35,8 @@ def digest(mask: Tensor) -> str:
 
 def identity(mpc: Any) -> dict[str, Any]:
     """Return what values depend on besides parameters and buffers."""
+    own = mpc.levels
+    arrays = (own.values, own.rows, own.rules, own.starts) if own else ()
     return {
         **asdict(mpc.layout),
         "blocks": [*mpc.layout.blocks] or None,  # None as in files from before blocks
@@ -43,7 +45,7 @@ def identity(mpc: Any) -> dict[str, Any]:
         "discount_slack": mpc.scheme.bounds.discount_slack,
         "learn": {x: digest(mpc._masks[x]) if x in mpc._masks else True for x in mpc.learned},
         "hard rows": digest(mpc.scheme.theta["w"].isinf()),
-        "action_levels": mpc.levels and repr(mpc.levels.identity),
+        "action_levels": own and repr([*(x.tolist() for x in arrays), own.max_nodes]),
         "dynamics": None if mpc.sequential is None else type(mpc.sequential.dynamics).__name__,
     }
 
