@@ -1,3 +1,4 @@
+import importlib
 import io
 import sys
 
@@ -12,6 +13,25 @@ from torch_qpmpc.qp.kernels.linalg import products, transposed_products
 RNG = np.random.default_rng(0)
 #: The spans of more than one matrix.
 NONE = np.zeros((0, 2), np.int64)
+
+
+def test_the_cache_is_renewed_when_a_called_kernel_changes(tmp_path, monkeypatch):
+    compiled = "from torch_qpmpc.qp.kernels.linalg import compiled\n{}\n\n@compiled\ndef {}"
+    called, caller = (tmp_path / f"{name}_kernel.py" for name in ("called", "caller"))
+    caller.write_text(
+        compiled.format("from called_kernel import f", "g(x):\n    return f(x) + 1.0\n")
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # which has times in whole seconds
+    found = []
+    for factor in (2.0, 2.0, 3.0):
+        called.write_text(compiled.format("", f"f(x):\n    return {factor} * x\n"))
+        for path in (called, caller):
+            monkeypatch.delitem(sys.modules, path.stem, raising=False)
+        importlib.invalidate_caches()
+        g = importlib.import_module(caller.stem).g
+        found.append((g(1.0), g.stats.cache_hits.total()))
+    assert found == [(3.0, 0), (3.0, 1), (4.0, 0)]
 
 
 def test_without_a_writable_cache_kernels_are_compiled_each_time(monkeypatch):

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 import numba
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 from numba.core.event import Event, Listener, register
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
@@ -19,11 +21,17 @@ ONE_THREAD = 2**18
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """Compile ``function``; cache the machine code on disk if its folder is writable."""
+    """Compile ``function``; cache it on disk, if writable, until a file that it uses changes."""
     try:
-        return numba.njit(cache=True, error_model="numpy", **options)(function)
+        kernel = numba.njit(cache=True, error_model="numpy", **options)(function)
     except RuntimeError:
         return numba.njit(error_model="numpy", **options)(function)
+    with suppress(AttributeError):  # these are private to Numba
+        own = kernel._cache._cache_file
+        called = (x for x in function.__globals__.values() if isinstance(x, Dispatcher))
+        stamps = (x._cache._cache_file._source_stamp for x in called)
+        own._source_stamp = {own._source_stamp}.union(*stamps)
+    return kernel
 
 
 class Progress(Listener):
