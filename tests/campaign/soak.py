@@ -23,9 +23,18 @@ VALUES = (np.inf, -np.inf, 3.4e38, -1e300, 1e20)
 
 
 def soak(
-    controller: qm.Controller, twin: CompiledController, steps: int, phases: int, seed: int
+    controller: qm.Controller,
+    twin: CompiledController,
+    steps: int,
+    phases: int,
+    seed: int,
+    size: float = 1.0,
+    faults: float = 1.0,
 ) -> tuple[float, Counter]:
-    """Return the largest difference of inputs, and counts of codes, faults and manual steps."""
+    """Return the largest difference of inputs, and counts of codes, faults and manual steps.
+
+    ``size`` scales set-points and known signals, ``faults`` the probabilities of faults.
+    """
     design, rng = controller.mpc.design, np.random.default_rng(seed)
     counts, largest = Counter(), 0.0
     plant, rows = design.plant, design.horizon + 1
@@ -36,14 +45,15 @@ def soak(
 
     def faulty(signal: np.ndarray) -> np.ndarray:
         """Return a signal with missing and absurd entries."""
-        dropped, absurd = rng.random(signal.shape) < DROPOUT, rng.random(signal.shape) < ABSURD
+        dropped = rng.random(signal.shape) < faults * DROPOUT
+        absurd = rng.random(signal.shape) < faults * ABSURD
         counts["dropouts"] += int(dropped.sum())
         counts["absurd values"] += int(absurd.sum())
         return np.where(dropped, np.nan, np.where(absurd, rng.choice(VALUES), signal))
 
     def spoiled(signal: np.ndarray, limits: np.ndarray) -> np.ndarray:
         """Return rows that now and then have an absurd entry, NaN where no number is too large."""
-        if not signal.size or rng.random() > ABSURD:
+        if not signal.size or rng.random() > faults * ABSURD:
             return signal
         counts["absurd values"] += 1
         signal, (k, i) = signal.copy(), rng.integers(signal.shape)
@@ -54,8 +64,9 @@ def soak(
     twin.reset(u=u)
     for k in range(steps):
         if k % 50 == 0:
-            disturbance, known = rng.uniform(-0.1, 0.1, m), 0.1 * rng.normal(size=(rows, n_d))
-            r = rng.uniform(-1, 1, (stages, n_y))
+            disturbance = rng.uniform(-0.1, 0.1, m)
+            known = 0.1 * size * rng.normal(size=(rows, n_d))
+            r = rng.uniform(-size, size, (stages, n_y))
         noise, unseen = 0.01 * rng.normal(size=n_y), faulty(np.zeros(n_y))
         y = x @ plant.C.T + noise + unseen
         if k // MANUAL in manual:

@@ -9,6 +9,7 @@ import qpsolvers
 from scipy.linalg import block_diag
 
 import torch_qpmpc as qm
+from tests.campaign.soak import soak
 from tests.control.controllers import exported
 from torch_qpmpc import QPError
 from torch_qpmpc.control.simulation import Run
@@ -98,23 +99,9 @@ def test_outputs_settle_at_the_steady_state_that_they_leave_nearest_to_the_set_p
 
 
 def test_c_keeps_them_alike():
-    controller, twin = exported(bounded, missing=True)
-    rng, x, held, prices = np.random.default_rng(0), np.zeros(2), 0, set()
-    for k in range(200):
-        if k % 25 == 0:
-            load, r = rng.uniform(-0.1, 0.1, 2), rng.uniform(-2, 2, 2)
-        y = x + 0.01 * rng.normal(size=2)
-        y[k % 2] = np.nan if k % 13 == 5 else y[k % 2]
-        u, (got, code) = controller.step(y, r), twin.step(y, r)
-        assert code == controller.status
-        assert np.abs(got - u).max() < 1e-8
-        assert u @ [1.0, 2.0] <= 1.5 + 1e-9
-        held += u @ [1.0, 2.0] > 1.5 - 1e-6
-        if k % 5 == 0:
-            prices |= {limit.signal for limit in controller.explain().limits}
-        x = A @ x + B @ (u + load)
-    assert held > 10
-    assert prices >= {"power", "mixed", "end"}
+    difference, counts = soak(*exported(bounded, missing=True), 300, 0, 0, size=2.0)
+    assert difference < 1e-8
+    assert {*counts} >= {"SOLVED", "MISSING"}
 
 
 def bounded(**options: Any) -> qm.Controller:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import torch_qpmpc as qm
+from tests.campaign.soak import soak
 from tests.control.controllers import exported as exported_once
 from tests.control.controllers import learned, load
 from torch_qpmpc import QPError, SolverError
@@ -42,36 +43,16 @@ MPCS = {
 }
 
 
-def difference(controller, twin, steps):
-    """Return the largest difference of inputs of a loop that the inputs of Python close."""
-    design, rng, largest = controller.mpc.design, np.random.default_rng(3), 0.0
-    (n, m, n_y, n_d), rows = design.plant.sizes, design.horizon + 1
-    plant, previewed = design.plant, design.references == "preview"
-    x, load, bias = np.zeros(n), np.zeros(m), np.zeros(n_y)
-    r, known = np.zeros((rows, n_y)), np.zeros((rows, n_d))
-    controller.reset()
-    twin.reset()
-    for k in range(steps):
-        if k % 50 == 0:
-            load, bias = rng.uniform(-0.1, 0.1, m), rng.uniform(-0.1, 0.1, n_y)
-            known = 0.1 * rng.normal(size=(rows, n_d))
-            r = rng.uniform(-1, 1, (rows if previewed else 1, n_y))
-        y = plant.C @ x + bias + 0.01 * rng.normal(size=n_y)
-        u = controller.step(y, r, known if n_d else None)
-        got, code = twin.step(y, r, known)
-        assert code == 0
-        largest = max(largest, np.abs(u - got).max())
-        x = plant.A @ x + plant.B @ (u + load) + plant.E @ known[0] + plant.offset
-    return largest
-
-
 @pytest.mark.parametrize("name", MPCS)
 def test_the_loop_is_that_of_python(tmp_path, name):
     controller = qm.Controller(MPCS[name]())
     report = controller.export_c(tmp_path)
     assert report.difference is not None
     assert report.difference < 1e-9
-    assert difference(controller, load(report.files, controller), STEPS) < 1e-9
+    twin = load(report.files, controller)
+    difference, counts = soak(controller, twin, STEPS, 0, 3, faults=0.0)
+    assert difference < 1e-9
+    assert counts["SOLVED"] == STEPS
 
 
 def zoned(half: float, **options: Any) -> qm.Controller:
@@ -85,27 +66,13 @@ def zoned(half: float, **options: Any) -> qm.Controller:
 def test_zones_are_those_of_python_with_gaps_and_in_manual_mode(half):
     controller, twin = exported_once(zoned, missing=True, half=half)
     assert controller.mpc.design.steady.anchors == 1
-    rng, x, at, codes = np.random.default_rng(4), np.zeros(3), 0, set()
-    for k in range(200):
-        if k % 25 == 0:
-            load, r = rng.uniform(-0.05, 0.05, 2), rng.uniform(-0.7, 0.7, (9, 2))
-            r[0, 1] = np.nan  # no set-point of y2 is needed
-        y = C @ x + 0.01 * rng.normal(size=2)
-        y[k % 2] = np.nan if k % 13 == 5 else y[k % 2]
-        if 80 <= k < 85:
-            u = np.array([0.3, -0.2])
-            controller.observe(y, u)
-            assert twin.observe(y, u) == controller.status
-        else:
-            u = controller.step(y, r)
-            got, code = twin.step(y, r)
-            codes.add(code)
-            assert code == controller.status
-            assert np.abs(got - u).max() < 1e-8
-        at += abs((C @ x)[1]) > 0.9 * half
-        x = A @ x + B @ (u + load)
-    assert codes == {0, 4}
-    assert (at > 20) == (half < 1)
+    difference, counts = soak(controller, twin, 300, 1, 4)
+    assert difference < 1e-8
+    assert min(counts[x] for x in ("SOLVED", "MISSING", "manual steps")) > 0
+    r = np.tile([0.5, np.nan], (9, 1))  # no set-point of y2 is needed
+    u, code = twin.step([0.1, 0.2], r)
+    assert code == 0
+    assert np.abs(controller.step([0.1, 0.2], r) - u).max() < 1e-8
 
 
 def test_a_set_point_at_a_soft_bound_with_a_large_price_is_certified(tmp_path):
@@ -234,7 +201,10 @@ def test_the_header_names_signals_and_the_report_has_the_size_of_the_state(tmp_p
 def test_single_precision_agrees_to_its_accuracy(tmp_path):
     controller = qm.Controller(integrator(y_bounds=None))
     report = controller.export_c(tmp_path, dtype="float32", storage="small")
-    assert difference(controller, load(report.files, controller, dtype="float32"), STEPS) < 1e-3
+    twin = load(report.files, controller, dtype="float32")
+    difference, counts = soak(controller, twin, STEPS, 0, 3, faults=0.0)
+    assert difference < 1e-3
+    assert counts["SOLVED"] == STEPS
 
 
 def test_without_a_compiler_nothing_is_compared(tmp_path, monkeypatch):

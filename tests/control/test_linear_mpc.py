@@ -101,38 +101,6 @@ def test_the_plan_is_that_of_the_problem_in_the_docstring(references, blocks, he
         assert np.allclose(target.u[-1] + mpc.plan.policy(p).detach(), u, atol=1e-5)
 
 
-def test_an_input_weight_moves_no_output_off_a_set_point_that_can_be_reached():
-    mpc = qm.LinearMPC((A, B, C), 10, Q=1.0, R=50.0)
-    expected = steady_state(np.array([0.3, -0.2]), np.zeros(2), np.zeros(2))
-    target = mpc.target([0.3, -0.2])
-    assert np.allclose(target.u, expected.u)
-    assert mpc.plan.policy(mpc.arrange(expected.x, target)).abs().max() < 1e-8
-
-
-def test_a_set_point_out_of_reach_is_tracked_as_near_as_the_bounds_allow():
-    mpc = qm.LinearMPC(SCALAR, 5, Q=1.0, u_bounds=(-1.0, 1.0))  # y = 5 u at rest
-    target = mpc.target([[7.0], [-3.0]], w=[1.0])
-    assert np.allclose(target.y, [[6.0], [-3.0]])
-    assert np.allclose(target.u, [[1.0], [-0.8]])
-    bounded = qm.LinearMPC(SCALAR, 5, Q=1.0, y_bounds=(-2.0, 2.0))
-    assert np.allclose(bounded.target([7.0]).y, [2.0])
-
-
-def test_an_integrator_with_a_load_beyond_its_input_s_bounds_has_a_target():
-    """The load alone determines the steady input, so that its bounds leave no choice."""
-    mpc = qm.LinearMPC(([[1.0]], [[1.0]]), 5, Q=1.0, dR=1.0, u_bounds=(-1.0, 1.0))
-    target = mpc.target([0.5], w=[3.0])
-    assert np.allclose([*target.y, *target.u], [0.5, -3.0])
-    p = mpc.arrange([0.5], target, u_last=[-1.0])
-    assert np.allclose(target.u + mpc.plan.policy(p).detach(), -1.0)
-
-
-def test_with_more_inputs_than_outputs_the_smallest_inputs_hold_the_set_point():
-    mpc = qm.LinearMPC(([[0.5]], [[1.0, 1.0]]), 5, Q=1.0, R=1.0, u_bounds=([-1, -1], [0.2, 1]))
-    assert np.allclose(mpc.target([0.2]).u, [0.05, 0.05], atol=1e-6)
-    assert np.allclose(mpc.target([1.0]).u, [0.2, 0.3], atol=1e-6)
-
-
 def test_without_a_riccati_solution_the_terminal_weight_is_the_stage_s():
     # The position has no weight and does not decay.
     mpc = qm.LinearMPC(([[1.0, 0.1], [0.0, 0.9]], [[0.0], [1.0]]), 3, Q=[0.0, 1.0], R=1.0)

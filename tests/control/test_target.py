@@ -121,14 +121,18 @@ def test_many_inputs_of_one_output_have_bounds_of_its_own():
     assert np.abs(target.u.numpy() - 1).max() < 1e-6
 
 
-def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target():
-    """Two inputs within 1 cannot hold a disturbance of 5: the target exceeds their bounds."""
-    mpc = qm.LinearMPC(([[1.0]], [[1.0, 0.5]], [[1.0]]), 5, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0))
-    target = mpc.target([0.0], 5.0)
-    assert np.isfinite(target.u.numpy()).all()
+@pytest.mark.parametrize("gains", [[1.0], [1.0, 0.5]])
+def test_a_load_beyond_the_inputs_of_an_integrator_has_a_target(gains):
+    """Inputs within 1 cannot hold a disturbance of 5: the target exceeds their bounds."""
+    weights: Any = {"Q": 1.0, "R": 0.1, "dR": 1.0, "u_bounds": (-1.0, 1.0)}
+    mpc = qm.LinearMPC(([[1.0]], [gains], [[1.0]]), 5, **weights)
+    target = mpc.target([0.5], 5.0)
+    assert np.isclose(target.y.item(), 0.5)
     u = target.u.numpy().ravel()
     assert u.min() < -1
-    assert abs(u @ [1.0, 0.5] + mpc.design.disturbances.B[0] @ np.full(1, 5.0)) < 1e-6
+    assert abs(u @ gains + mpc.design.disturbances.B[0] @ np.full(1, 5.0)) < 1e-6
+    p = mpc.arrange([0.5], target, u_last=-np.ones(len(gains)))
+    assert np.allclose(u + mpc.plan.policy(p).detach().numpy(), -1.0)
 
 
 def test_rounding_beside_outputs_of_large_numbers_sets_no_length():
