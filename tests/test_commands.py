@@ -20,7 +20,8 @@ from typing import NamedTuple
 import pytest
 
 from tests.pages import PAGES, ROOT, fenced, needs_docs
-from tests.runs import SMALL, ended, run_command
+from tests.runs import SMALL, ended, make_config, run_command
+from torch_qpmpc.experiment.tasks.code import named_task
 
 pytestmark = needs_docs
 
@@ -189,14 +190,29 @@ def documented() -> dict[str, list[str]]:
 
 DOCUMENTED = documented()
 NAMED = {shlex.join(shlex.split(command)): short for command, short in SHORT.items()}
+EVERY = (*NAMED, *CANNOT)
 
 
 def test_each_documented_command_has_an_entry():
     found = {command: page for page, of in DOCUMENTED.items() for command in of}
-    unknown = [f"{page}: {x}" for x, page in found.items() if x not in {*NAMED, *CANNOT}]
+    unknown = [f"{page}: {x}" for x, page in found.items() if x not in EVERY]
     assert not unknown, "shorten it in SHORT, or say in CANNOT why it does not run"
-    assert not {*NAMED, *CANNOT} - {*found}, "no page has it any more"
+    assert not {*EVERY} - {*found}, "no page has it any more"
     assert not {*NAMED} & {*CANNOT}
+
+
+def test_modules_that_commands_run_exist():
+    modules = {x.split()[2] for x in EVERY if re.match(r"python -m (tests|torch_qpmpc)\.", x)}
+    assert [x for x in modules if importlib.util.find_spec(x) is None] == []
+
+
+@pytest.mark.parametrize("command", [x for x in EVERY if re.match("python train(?!.*my_task)", x)])
+def test_train_commands_have_possible_settings(command, monkeypatch):
+    monkeypatch.chdir(ROOT)  # of the paths of examples
+    overrides = [word for word in shlex.split(command)[2:] if word != "-m"]
+    # Of a sweep, the first of each choice.
+    first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
+    make_config(*named_task(first))
 
 
 @pytest.mark.usefixtures("rough_fits")

@@ -1,20 +1,18 @@
-"""The documentation holds: its Python runs, its commands are possible, its names exist."""
+"""The documentation holds: its Python runs, its names exist."""
 
 import doctest
 import importlib
 import importlib.util
 import json
 import re
-import shlex
 import sys
 
 import pytest
 
 import torch_qpmpc
 from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
-from tests.runs import SMALL, ended, make_config
+from tests.runs import SMALL, ended
 from torch_qpmpc.experiment.tasks import TASKS
-from torch_qpmpc.experiment.tasks.code import named_task
 from torch_qpmpc.identification import learned
 from torch_qpmpc.proofs import invariant
 from torch_qpmpc.qp import solvers
@@ -25,17 +23,6 @@ EXAMPLES = sorted(
     for path in (ROOT / "torch_qpmpc").rglob("*.py")
     if ">>> " in path.read_text(encoding="utf-8")
 )
-
-
-def commands(text: str) -> list[list[str]]:
-    """Return the commands of a page's bash blocks, split into words."""
-    blocks = [code.replace("\\\n", "") for _, code in fenced(text, "bash")]
-    lines = [line for code in blocks for line in code.splitlines()]
-    return [shlex.split(part, comments=True) for line in lines for part in line.split("&&")]
-
-
-COMMANDS = {page: commands(text) for page, text in PAGES.items()}
-
 
 #: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs,
 #: and the tests of `improve` have shorter loops.
@@ -61,41 +48,6 @@ def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     for line, code in fenced(PAGES[page], "python"):
         # Blank lines first, so that a traceback names the page's own line.
         exec(compile("\n" * line + code, page, "exec"), namespace)
-
-
-#: The words of each command ``python train.py ..``, and a page that has it.
-TRAIN = {
-    tuple(words[2:]): page
-    for page, of_page in COMMANDS.items()
-    for words in of_page
-    if words[:2] == ["python", "train.py"] and not re.search("NAME|my_task", "".join(words))
-}
-
-
-@pytest.mark.parametrize(
-    "command", [pytest.param(x, id=f"{page}: {' '.join(x[:2])}") for x, page in TRAIN.items()]
-)
-def test_train_commands_have_possible_settings(command, monkeypatch):
-    monkeypatch.chdir(ROOT)  # of the paths of examples
-    overrides = [word for word in command if word != "-m"]
-    # Of a sweep, the first of each choice.
-    first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
-    make_config(*named_task(first))
-
-
-@pytest.mark.parametrize(
-    "module",
-    sorted(
-        {
-            words[2]
-            for of_page in COMMANDS.values()
-            for words in of_page
-            if words[:2] == ["python", "-m"] and words[2].startswith(("tests", "torch_qpmpc"))
-        }
-    ),
-)
-def test_modules_that_commands_run_exist(module):
-    assert importlib.util.find_spec(module) is not None
 
 
 @needs_docs

@@ -53,7 +53,6 @@ pendulum, episode = GymnasiumPlant("Pendulum-v1"), PointMassGymEnv()
 episode.reset(seed=0)
 R = partial(Replay, 64, 2, 4, 3, 2)
 Loss, Newton = partial(qm.QPQLearningLoss, op), partial(qm.GaussNewton, mpc)
-LTI = partial(qm.QPMPC.from_model, A2, B1)
 
 
 def one(s: Tensor) -> Tensor:
