@@ -514,11 +514,7 @@ def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):
 
 def program(H: Tensor, n_known: int) -> QuadraticProgram:
     """Make a QP in two variables without constraints."""
-    none, one = torch.zeros(0).double(), torch.zeros(()).double()
-    zeros = torch.zeros(0, 2).double()
-    return QuadraticProgram(
-        H, torch.zeros(2).double(), one, zeros, none, zeros, none, none, none, n_known=n_known
-    )
+    return QuadraticProgram(H, torch.zeros(2).double(), n_known=n_known)
 
 
 def test_an_indefinite_block_of_what_is_known_is_accepted():

@@ -330,10 +330,7 @@ def test_single_precision_in_single_precision_out(solver):
 def test_an_asymmetry_within_the_tolerance_of_single_precision_does_no_harm():
     H, unit = torch.eye(2), torch.ones(2)
     H[0, 1] = 8e-6
-    none = torch.zeros(0)
-    qp = QuadraticProgram(
-        H, -100 * unit, torch.zeros(()), none.reshape(0, 2), none, H, -1e9 * unit, 1e9 * unit, unit
-    )
+    qp = QuadraticProgram(H, -100 * unit, G=H, lb=-1e9 * unit, ub=1e9 * unit, w=unit)
     assert_close(solve_qp(qp, solver="daqp").z, 100 * unit, rtol=1e-5, atol=0)
 
 

@@ -89,17 +89,7 @@ def test_at_a_kink_the_gradient_is_one_of_the_one_sided_derivatives():
     # min 1/2 (z - s)^2 over z <= 1 at s = 1: the bound is reached, with a zero multiplier.
     one = torch.ones(1, dtype=torch.float64)
     s = one.clone().requires_grad_()
-    qp = QuadraticProgram(
-        torch.eye(1).double(),
-        -s,
-        one.sum() * 0,
-        torch.zeros(0, 1).double(),
-        torch.zeros(0).double(),
-        torch.eye(1).double(),
-        -one,
-        one,
-        one * torch.inf,
-    )
+    qp = QuadraticProgram(one.diag(), -s, lb=-one, ub=one)
     (gradient,) = torch.autograd.grad(solve_qp(qp, solver="daqp").z.sum(), s)
     assert gradient.item() in (pytest.approx(0.0, abs=1e-9), pytest.approx(1.0, abs=1e-9))
 
@@ -110,36 +100,15 @@ def test_dependent_active_rows_have_a_finite_gradient():
     q = torch.tensor([-3.0, 0.5], dtype=torch.float64, requires_grad=True)
     upper = one.clone().requires_grad_()
     G = torch.tensor([[1.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
-    qp = QuadraticProgram(
-        torch.eye(2).double(),
-        q,
-        q.new_zeros(()),
-        q.new_zeros(0, 2),
-        q.new_zeros(0),
-        G,
-        -one,
-        upper,
-        one * torch.inf,
-    )
-    z = solve_qp(qp, solver="proxqp").z
+    z = solve_qp(QuadraticProgram(one.diag(), q, G=G, lb=-one, ub=upper), solver="proxqp").z
     of_q, of_upper = torch.autograd.grad(z.sum(), (q, upper))
     assert_close(of_q, torch.tensor([0.0, -1.0]).double(), atol=1e-6, rtol=0)
     assert_close(of_upper.sum(), torch.tensor(1.0).double(), atol=1e-6, rtol=0)
 
 
 def test_a_fully_fixed_z_moves_with_the_fixed_entries():
-    one, none = torch.ones(1).double(), torch.zeros(0, 1).double()
-    qp = QuadraticProgram(
-        H=torch.eye(1).double(),
-        q=one,
-        c=one[0],
-        C=none,
-        b=none[:, 0],
-        G=torch.eye(1).double(),
-        lb=-2 * one,
-        ub=2 * one,
-        w=torch.inf * one,
-    )
+    one = torch.ones(1).double()
+    qp = QuadraticProgram(one.diag(), one, lb=-2 * one, ub=2 * one)
     fixed = normal(3, 1).clamp(-1, 1).requires_grad_()
     (slope,) = torch.autograd.grad(solve_qp(qp, fixed).z.sum(), fixed)
     assert_close(slope, torch.ones_like(fixed))
@@ -180,10 +149,8 @@ def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
         qp = QuadraticProgram(
             H=H * cost / length**2,
             q=q * cost / length,
-            c=torch.zeros((), dtype=torch.float64),
             C=C / length,
             b=torch.zeros(1, dtype=torch.float64),
-            G=torch.eye(6, dtype=torch.float64),
             lb=-box * length,
             ub=box * length,
             w=w * cost / length,
@@ -310,9 +277,7 @@ def test_opposite_rows_are_recognised_in_all_units(dtype, unit):
         # Exact in float32: rows that are opposite up to rounding alone have another solution.
         rows = torch.tensor([[0.375, 0.75], [-0.09375, -0.1875]], dtype=dtype)
         ub = torch.stack((t, -t / 4))
-        none = one.new_zeros(0)
-        data = torch.eye(2, dtype=dtype), 0 * one, 0 * one[0], none.reshape(0, 2), none
-        qp = QuadraticProgram(*data, rows, -INF * one, ub, INF * one, check_values=False)
+        qp = QuadraticProgram(one.diag(), 0 * one, G=rows, ub=ub, check_values=False)
         return solve_qp(qp, solver="daqp").z
 
     # At t = 0 the multipliers are zero. z is linear in t.
@@ -324,9 +289,8 @@ def test_equal_bounds_share_the_gradient_evenly_at_a_zero_multiplier():
     zero, eye = torch.zeros(1, dtype=torch.float64), torch.eye(1, dtype=torch.float64)
 
     def part(name: str) -> Callable[[Tensor, Tensor], Tensor]:
-        data = eye, zero, zero[0], eye[:0], zero[:0], eye
         return lambda lb, ub: getattr(
-            solve_qp(QuadraticProgram(*data, lb, ub, INF + zero, check_values=False)), name
+            solve_qp(QuadraticProgram(eye, zero, lb=lb, ub=ub, check_values=False)), name
         )
 
     for jacobian in (jacrev, jacfwd):
@@ -342,8 +306,8 @@ def test_second_derivatives_do_not_reach_the_other_bound_of_a_row():
 
     def value(lower: Tensor, t: Tensor) -> Tensor:
         lb, ub = torch.cat((lower, -INF * one)), torch.cat((t, -t))
-        data = eye, 0 * one, 0 * one[0], eye[:0], one[:0], torch.cat((eye, -eye))
-        qp = QuadraticProgram(*data, lb, ub, INF * one.expand(2), check_values=False)
+        G = torch.cat((eye, -eye))
+        qp = QuadraticProgram(eye, 0 * one, G=G, lb=lb, ub=ub, check_values=False)
         return solve_qp(qp, solver="daqp").value
 
     for second in (hessian, lambda f, argnums: jacrev(jacrev(f, argnums), argnums)):
@@ -402,8 +366,8 @@ def test_a_slack_has_no_slope_where_its_row_is_about_to_be_held():
     one = torch.ones(1, dtype=torch.float64)
 
     def sigma(s: Tensor) -> Tensor:
-        data = one.diag(), -s, 0 * one[0], one.diag()[:0], one[:0], one.diag(), -one, one, 5 * one
-        return solve_qp(QuadraticProgram(*data, check_values=False), solver="daqp").sigma
+        qp = QuadraticProgram(one.diag(), -s, lb=-one, ub=one, w=5 * one, check_values=False)
+        return solve_qp(qp, solver="daqp").sigma
 
     assert jacrev(sigma)(one).item() == 0
     assert sigma(1.01 * one).item() == sigma(0.99 * one).item() == 0
@@ -414,11 +378,10 @@ def test_more_active_rows_than_variables_give_a_consistent_derivative(solver):
     """z_1 <= 1, z_2 <= 1 and z_1 + z_2 <= 2, moved together, take z with them."""
     one = torch.ones(3, dtype=torch.float64)
     rows = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
-    none = one.new_zeros(0)
 
     def z(ub: Tensor) -> Tensor:
-        data = torch.eye(2).double(), -5 * one[:2], 0 * one[0], none.reshape(0, 2), none
-        return solve_qp(QuadraticProgram(*data, rows, -9 * one, ub, INF * one), solver=solver).z
+        qp = QuadraticProgram(one[:2].diag(), -5 * one[:2], G=rows, lb=-9 * one, ub=ub)
+        return solve_qp(qp, solver=solver).z
 
     slope = torch.autograd.functional.jacobian(z, vector(1.0, 1.0, 2.0))
     assert_close(slope @ vector(1.0, 1.0, 2.0), vector(1.0, 1.0))
@@ -455,10 +418,9 @@ def test_the_schur_complement_gives_the_gradients_of_the_whole_system(matrices, 
 def test_gradients_are_linear_in_what_comes_in(size, monkeypatch):
     """All variables are at a bound, so that only rounding errors are left of p."""
     monkeypatch.setattr(kkt, "_solve_dense", None)
-    one, none = torch.ones(2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64)
+    one = torch.ones(2, dtype=torch.float64)
     H, ub = vector(2.0, 0.3, 0.3, 1.0).reshape(2, 2), vector(1.0, 0.5).requires_grad_()
-    data = H, -5 * one, 0 * one[0], none, none[:, 0], one.diag(), -one, ub, INF * one
-    z = solve_qp(QuadraticProgram(*data), solver="daqp").z
+    z = solve_qp(QuadraticProgram(H, -5 * one, lb=-one, ub=ub), solver="daqp").z
     (gradient,) = torch.autograd.grad(size * (z * vector(0.7, -0.2)).sum(), ub)
     assert_close(gradient / size, vector(0.7, -0.2), rtol=1e-12, atol=0)
 

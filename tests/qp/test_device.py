@@ -105,18 +105,7 @@ def test_statuses():
     lb = torch.tensor([[-1.0, -inf], [2.0, -inf], [-inf, -inf], [-1.0, -inf]]).double()
     ub = torch.tensor([[1.0, 5.0], [3.0, 1.0], [inf, 5.0], [1.0, 5.0]]).double()
     q = torch.tensor([-2.0, 0.0, 1.0, torch.nan]).double().unsqueeze(-1)
-    qp = qm.QuadraticProgram(
-        H,
-        q,
-        torch.zeros(4).double(),
-        torch.zeros(0, 1).double(),
-        torch.zeros(0).double(),
-        torch.ones(2, 1).double(),
-        lb,
-        ub,
-        inf * one.expand(4, 2),
-        check_values=False,
-    )
+    qp = qm.QuadraticProgram(H, q, G=one[:2], lb=lb, ub=ub, check_values=False)
     with in_tensors():
         solution = qm.solve_qp(moved(qp, DEVICE), solver="torch", on_failure="mask")
     expected = ["SOLVED", "INFEASIBLE", "UNBOUNDED", "INVALID_DATA"]

@@ -274,10 +274,8 @@ def test_a_violation_counts_by_the_step_that_ends_it():
 
 def bounded_by_both(least: float, noise: float = 0.0) -> Certificate:
     """Judge v = 2 of an input 52.5 + v in [least, 80] whose move v is at most 2."""
-    data: dict[str, Any] = {"H": torch.eye(2), "q": [0.0, -3.0], "c": 0.0}
-    data |= {"C": torch.zeros(0, 2), "b": []}
+    data: dict[str, Any] = {"H": torch.eye(2), "q": [0.0, -3.0]}
     data |= {"G": [[1.0, 1.0], [0.0, 1.0]], "lb": [least, -2.0], "ub": [80.0, 2.0]}
-    data |= {"w": [torch.inf] * 2}
     parts: Any = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
     z, lam = torch.tensor([[52.5, 2.0]]).double(), torch.tensor([[noise, 1.0]]).double()
     p, _ = Programs.of(*QuadraticProgram(**parts).tensors(), z[:, :1])
@@ -330,10 +328,9 @@ VIOLATIONS = [(3e-8, True), (3e-5, False)]
 @pytest.mark.parametrize("length", [1e-6, 1.0, 1e6])
 def test_the_certificate_judges_rows_of_all_lengths_alike(low, length, off, right):
     """Of z_1 <= 0.5 beside z_2 <= 1e6, both in lengths, a solution is beyond its bound."""
-    one, inf = torch.eye(2).double(), torch.full((2,), torch.inf).double()
+    one, lb = torch.eye(2).double(), torch.full((2,), low).double()
     G, ub = torch.diag(vector(length, 1.0)), vector(0.5 * length, 1e6)
-    q, lb, none = vector(-1.0, 0.0), torch.full((2,), low).double(), one[:0]
-    qp = QuadraticProgram(one, q, q[1], none, none[:, 0], G, lb, ub, inf)
+    qp = QuadraticProgram(one, vector(-1.0, 0.0), G=G, lb=lb, ub=ub)
     z = vector(0.5 * (1 + off), 0.0)[None]
     lam = (1 - z) / length * one[:1]
     plain = Programs.of(*qp.tensors(), z[:, :0])[0]

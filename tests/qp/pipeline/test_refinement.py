@@ -78,8 +78,8 @@ def test_a_solution_that_ran_along_a_flat_direction_comes_back(held):
     far = 1e5 * np.linalg.svd(np.vstack((factor, G[:1])))[2][-1]
     ub = np.array([G[0] @ z, G[1] @ (z + far) if G[1] @ far > 0 else inf])
     q = -factor.T @ factor @ z - G[0]
-    data = {"H": factor.T @ factor, "q": q, "c": 0.0, "C": np.zeros((0, 6)), "b": []}
-    data |= {"G": G * [[1], [np.sign(G[1] @ far)]], "lb": [-inf] * 2, "ub": ub, "w": [inf] * 2}
+    G = G * [[1], [np.sign(G[1] @ far)]]
+    data = {"H": factor.T @ factor, "q": q, "G": G, "ub": ub}
     parts: Any = {name: torch.as_tensor(x, dtype=torch.float64) for name, x in data.items()}
     p, _ = Programs.of(*QuadraticProgram(**parts).tensors(), torch.zeros(1, 0))
     ran = p.unsolved(0)._replace(z=(z + far)[None], lam=lam[None], active=np.sign(lam)[None])

@@ -98,9 +98,10 @@ def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub
 
     monkeypatch.setitem(BACKENDS, "above", doctored(above))
     H, G = torch.diag(torch.tensor([0.0, 1e-4, 1e-4])), torch.tensor([[0, 3.0, 0], [0, 0, 0.5]])
-    q, c, none, two = torch.tensor([0.0, 0.03, 0.7]), torch.zeros(()), torch.zeros(0), torch.ones(2)
-    tensors = (H, q, c, none.reshape(0, 3), none, G, 0 * two, ub * two, w * two)
-    qp = QuadraticProgram(*(x.double() for x in tensors), check_values=False)
+    two: Any = torch.ones(2)
+    data = {"H": H, "q": torch.tensor([0.0, 0.03, 0.7]), "G": G}
+    data |= {"lb": 0 * two, "ub": ub * two, "w": w * two}
+    qp = QuadraticProgram(**{key: x.double() for key, x in data.items()}, check_values=False)
     solution = solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
     assert solution.iterations.any() == refined  # those of the refinement
     assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
@@ -119,7 +120,7 @@ def standing(stages: int) -> QuadraticProgram:
     H = torch.diag(torch.tensor([0, 0, 10, 0.3]).double().repeat(stages))
     b, G = torch.tensor([0, -9.81 * dt]).double().repeat(stages), torch.block_diag(*[rows] * stages)
     q = torch.zeros(n).double()
-    return QuadraticProgram(H, q, q.sum(), C, b, G, q, ub.flatten(), q + torch.inf)
+    return QuadraticProgram(H, q, C=C, b=b, G=G, lb=q, ub=ub.flatten())
 
 
 @pytest.mark.parametrize("solver", BACKENDS)
