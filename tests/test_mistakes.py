@@ -30,7 +30,6 @@ from torch_qpmpc.analysis.structure import (
 )
 from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
-from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.mpc.riccati import lqr_gain
@@ -51,8 +50,7 @@ pair = prediction_form(torch.stack([mpc.C_0] * 2), 2, 1)
 model, pm = nearest_model(form), PointMass()
 pendulum, episode = GymnasiumPlant("Pendulum-v1"), PointMassGymEnv()
 episode.reset(seed=0)
-R = partial(Replay, 64, 2, 4, 3, 2)
-Loss, Newton = partial(qm.QPQLearningLoss, op), partial(qm.GaussNewton, mpc)
+Loss = partial(qm.QPQLearningLoss, op)
 
 
 def one(s: Tensor) -> Tensor:

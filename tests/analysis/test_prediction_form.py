@@ -14,26 +14,14 @@ N_X, N_U, N = 3, 2, 5
 OFFSET = normal(N, N_X, seed=7)
 
 
-def scheme(stages: tuple[int, ...] = (), seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Draw A and B of one model, or of one per stage."""
-    return 0.6 * normal(*stages, N_X, N_X, seed=seed), normal(*stages, N_X, N_U, seed=seed + 1)
-
-
-def constraints(kind: str, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Make C and b of an MPC scheme, or of none."""
-    A, B = scheme((N,) if kind == "varying" else (), seed)
-    C = banded_matrix(A, B, N)
-    if kind == "free":
-        C = C + 0.1 * normal(*C.shape, seed=seed + 2)
-    return C, -OFFSET.flatten()
-
-
-def gauge(seed: int) -> Tensor:
-    return normal(N * N_X, N * N_X, seed=100 + seed)
+def constraints(off: float = 0.1, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Make C and b of an MPC scheme, with entries that are off."""
+    C = banded_matrix(0.6 * normal(N_X, N_X, seed=seed), normal(N_X, N_U, seed=seed + 1), N)
+    return C + off * normal(*C.shape, seed=seed + 2), -OFFSET.flatten()
 
 
 def test_a_batch_is_its_elements():
-    both = [constraints("free", seed) for seed in (0, 1)]
+    both = [constraints(seed=seed) for seed in (0, 1)]
     C, b = (torch.stack(parts) for parts in zip(*both, strict=True))
     form = prediction_form(C, N_X, N_U, b)
     for i, (C_i, b_i) in enumerate(both):
@@ -42,34 +30,29 @@ def test_a_batch_is_its_elements():
             torch.testing.assert_close(getattr(form, part)[i], getattr(alone, part))
 
 
-def _of(kind: str) -> tuple[Tensor, int, int, Tensor]:
-    C, b = constraints(kind)
-    return C, N_X, N_U, b
-
-
 def test_a_small_C_is_as_good_as_any():
-    C, n_x, n_u, b = _of("free")
+    C, b = constraints()
     scale = torch.logspace(-12, 3, len(C)).double().unsqueeze(-1)
-    form = prediction_form(C, n_x, n_u, b)
-    scaled = prediction_form(scale * C, n_x, n_u, scale[:, 0] * b)
+    form = prediction_form(C, N_X, N_U, b)
+    scaled = prediction_form(scale * C, N_X, N_U, scale[:, 0] * b)
     torch.testing.assert_close(scaled.Gamma, form.Gamma)
     torch.testing.assert_close(scaled.condition, form.condition)
 
 
 def test_a_C_that_does_not_determine_the_states_is_refused():
-    C, n_x, n_u, _ = _of("tied")
+    C, _ = constraints(off=0.0)
     dependent = C.clone()
     dependent[4] = dependent[2] - dependent[7]
     with pytest.raises(QPError, match=r"C: got state columns of rank 14 of 15 \(condition number"):
-        prediction_form(dependent, n_x, n_u)
+        prediction_form(dependent, N_X, N_U)
     unseen = C.clone()
     unseen[:, [N_X + N_U, -1]] = 0  # entries of x_1 and of x_N
     with pytest.raises(QPError, match=r"of rank 13 of 15.*have no prediction form"):
-        prediction_form(unseen, n_x, n_u)
+        prediction_form(unseen, N_X, N_U)
     with pytest.raises(QPError, match="of rank 0 of 15"):
-        prediction_form(torch.zeros_like(C), n_x, n_u)
+        prediction_form(torch.zeros_like(C), N_X, N_U)
     with pytest.raises(QPError, match="of rank 14 of 15"):
-        prediction_form(torch.stack((C, dependent)), n_x, n_u)
+        prediction_form(torch.stack((C, dependent)), N_X, N_U)
 
 
 @refused(

@@ -58,12 +58,6 @@ def model() -> PredictionForm:
     return model_form(A, B, N, OFFSET, E)
 
 
-def free_form(seed: int = 0) -> PredictionForm:
-    C = banded_matrix(A, B, N, E)
-    C = C + 0.1 * normal(*C.shape, seed=seed)
-    return prediction_form(C, N_X, N_U, -OFFSET.repeat(N), N_D)
-
-
 # The prediction form
 
 
@@ -116,6 +110,7 @@ def test_errors_of_the_model():
     moment = second_moment(s, a, d)
     expected = error.square().sum(-1).mean().sqrt()
     assert_close(one_step_error(found, *wrong[:2], OFFSET, moment, wrong[2]), expected)
+    assert_close(one_step_error(found, A, B, E=E), OFFSET.norm())
 
 
 def test_the_gain_is_the_slope_of_the_policy_in_all_that_is_known():
@@ -162,14 +157,14 @@ def test_the_band_of_a_preview():
         ]
     )
     weights = {"c_1": a, "c_2": o, "c_3": b}
-    mpc = drawn_mpc(1, 1, 3, n_d=1)
+    mpc, moved = drawn_mpc(1, 1, 3, n_d=1), torch.arange(33).view(3, 11) - 16
     assert torch.equal(DeviationPenalty(mpc, **weights).C_mask, expected.double())
     with torch.no_grad():
-        mpc.C += torch.arange(33).view(3, 11)
+        mpc.C += moved
     found = distance_by_band(mpc)
     for name, weight in (("on", o), ("above", a), ("below", b)):
         where = expected == weight
-        assert found[name] == torch.arange(33).view(3, 11)[where].sum()
+        assert found[name] == moved[where].abs().sum()
     distance = band_distance(LAYOUT)
     C = banded_matrix(A, B, N, E)
     assert (C[distance != 0] == 0).all()

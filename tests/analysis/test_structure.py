@@ -8,16 +8,13 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from tests.problems import drawn_mpc, model_form, normal
+from tests.problems import model_form, normal
 from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.structure import (
-    NearestModel,
     PredictionForm,
     canonical_matrix,
     causality_defect,
-    distance_by_band,
     nearest_model,
-    one_step_error,
     prediction_form,
     stage_models,
     toeplitz_defect,
@@ -29,22 +26,6 @@ generator = torch.Generator().manual_seed(0)
 A = torch.randn(N_X, N_X, generator=generator, dtype=torch.float64)
 B = torch.randn(N_X, N_U, generator=generator, dtype=torch.float64)
 C_0 = banded_matrix(A, B, N)
-C = C_0 + torch.randn(C_0.shape, generator=generator, dtype=torch.float64)
-
-
-def test_distances_are_the_blocks_sums():
-    mpc = drawn_mpc(N_X, N_U, N, A=A, B=B, structure="free")
-    with torch.no_grad():
-        mpc.C += C - C_0
-    expected = {"on": 0.0, "above": 0.0, "below": 0.0}
-    for k in range(N):
-        rows = slice(k * N_X, (k + 1) * N_X)
-        first, last = k * (N_X + N_U), (k + 1) * (N_X + N_U) + N_X
-        deviation = (C - C_0)[rows].abs()
-        expected["below"] += deviation[:, :first].sum().item()
-        expected["on"] += deviation[:, first:last].sum().item()
-        expected["above"] += deviation[:, last:].sum().item()
-    assert distance_by_band(mpc) == pytest.approx(expected)
 
 
 def form_of(C: Tensor, b: Tensor | None = None) -> PredictionForm:
@@ -170,27 +151,3 @@ def test_an_older_pair_is_in_the_residual_of_the_stages():
     assert stage_models(form).residual[1:].min() > 1e-3
     assert causality_defect(form) < 1e-10
     assert stage_models(form_of(T @ scheme_with())).residual.max() < 1e-9
-
-
-TRUE_A, TRUE_B, OFFSET = normal(3, 3, seed=1), normal(3, 2, seed=2), normal(3, seed=3)
-
-
-def model(*stages: int) -> NearestModel:
-    residual = torch.zeros(stages)
-    return NearestModel(
-        TRUE_A + 0.1 * normal(*stages, 3, 3, seed=6),
-        TRUE_B + 0.1 * normal(*stages, 3, 2, seed=7),
-        torch.zeros(*stages, 3, 0),
-        OFFSET + 0.1 * normal(*stages, 3, seed=8),
-        residual,
-    )
-
-
-def test_error_over_unit_variance_is_the_frobenius_norm():
-    wrong = model()
-    parts = (wrong.A - TRUE_A, wrong.B - TRUE_B, wrong.offset)
-    expected = sum(part.square().sum().item() for part in parts) ** 0.5
-    assert one_step_error(wrong, TRUE_A, TRUE_B).item() == pytest.approx(expected)
-    right = NearestModel(TRUE_A, TRUE_B, torch.zeros(3, 0), OFFSET, torch.zeros(()))
-    assert one_step_error(right, TRUE_A, TRUE_B, OFFSET) == 0
-    assert one_step_error(right, TRUE_A, TRUE_B).item() == pytest.approx(OFFSET.norm().item())
