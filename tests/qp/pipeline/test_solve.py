@@ -98,10 +98,9 @@ def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub
 
     monkeypatch.setitem(BACKENDS, "above", doctored(above))
     H, G = torch.diag(torch.tensor([0.0, 1e-4, 1e-4])), torch.tensor([[0, 3.0, 0], [0, 0, 0.5]])
-    two: Any = torch.ones(2)
-    data = {"H": H, "q": torch.tensor([0.0, 0.03, 0.7]), "G": G}
-    data |= {"lb": 0 * two, "ub": ub * two, "w": w * two}
-    qp = QuadraticProgram(**{key: x.double() for key, x in data.items()}, check_values=False)
+    two, q = torch.ones(2).double(), torch.tensor([0.0, 0.03, 0.7]).double()
+    rows = {"G": G.double(), "lb": 0 * two, "ub": ub * two, "w": w * two}
+    qp = QuadraticProgram(H.double(), q, **rows, check_values=False)
     solution = solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
     assert solution.iterations.any() == refined  # those of the refinement
     assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
