@@ -1,6 +1,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,8 +100,8 @@ def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub
     monkeypatch.setitem(BACKENDS, "above", doctored(above))
     H, G = torch.diag(torch.tensor([0.0, 1e-4, 1e-4])), torch.tensor([[0, 3.0, 0], [0, 0, 0.5]])
     two, q = torch.ones(2).double(), torch.tensor([0.0, 0.03, 0.7]).double()
-    rows = {"G": G.double(), "lb": 0 * two, "ub": ub * two, "w": w * two}
-    qp = QuadraticProgram(H.double(), q, **rows, check_values=False)
+    parts: Any = {"G": G.double(), "lb": 0 * two, "ub": ub * two, "w": w * two}
+    qp = QuadraticProgram(H.double(), q, **parts, check_values=False)
     solution = solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
     assert solution.iterations.any() == refined  # those of the refinement
     assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
