@@ -14,6 +14,7 @@ from tests.problems import random_mpc, random_states
 from tests.refused import refused
 from torch_qpmpc import QPMPC, Layout, QPError
 from torch_qpmpc.export.tables import make_tables
+from torch_qpmpc.mpc.layout import band_distance, banded_matrix
 
 # Sizes
 
@@ -35,6 +36,29 @@ def test_sizes_are_whole_numbers_of_any_kind():
 )
 def test_bad_sizes_are_named(sizes):
     Layout(**({"n_x": 2, "n_u": 1, "horizon": 3} | sizes))
+
+
+# The band
+
+
+def test_band_distance_counts_stages():
+    expected = [
+        # x_0, u_0, x_1, u_1, x_2, u_2, x_3
+        [0, 0, 0, 1, 1, 2, 2],
+        [-1, -1, 0, 0, 0, 1, 1],
+        [-2, -2, -1, -1, 0, 0, 0],
+    ]
+    assert band_distance(Layout(1, 1, 3)).tolist() == expected
+
+
+@refused(
+    ((2, 3), (3, 2), r"A: got shape \(2, 3\), expected shape \(2, 2\) or \(4, 2, 2\)"),
+    ((5, 3, 3), (3, 2), r"A: got shape \(5, 3, 3\), expected shape \(3, 3\) or \(4, 3, 3\)"),
+    ((3, 3), (2, 2), r"B: got shape \(2, 2\), expected shape \(3, 2\) or \(4, 3, 2\)"),
+    ((3, 3), (5, 3, 2), r"B: got shape \(5, 3, 2\), expected shape \(3, 2\) or \(4, 3, 2\)"),
+)
+def test_a_model_that_does_not_fit_is_named(A, B):
+    banded_matrix(torch.ones(A), torch.ones(B), 4)
 
 
 # Blocks

@@ -277,6 +277,8 @@ def test_sizes_and_the_parts_of_z():
     assert_close(mpc.solve(p).z[:, :N_P], p)
     assert_close(mpc.solve(p, a).z[:, : N_P + N_U], torch.cat((p, a), -1))
     assert_close(mpc.policy(p), mpc.solve(p).z[:, N_P : N_P + N_U])
+    with pytest.raises(QPError, match=r"z: got shape \(6, 10\), expected shape \(\*batch, 19\)"):
+        mpc.predicted(torch.ones(6, N_P))
 
 
 def test_stages_may_have_weights_and_models_of_their_own():
@@ -589,8 +591,3 @@ def test_predict_takes_any_array_of_numbers(kind):
     s = np.array([[1.0], [2.0], [-3.0]])
     given = mpc.predict(s[::-1].astype(kind)[::-1])
     np.testing.assert_allclose(given, mpc.predict(s), rtol=1e-6)
-
-
-def test_the_plan_that_is_predicted_has_the_size_of_z():
-    with pytest.raises(QPError, match=r"z: got shape \(6, 10\), expected shape \(\*batch, 19\)"):
-        previewed().predicted(torch.ones(6, N_P))

@@ -7,12 +7,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.problems import normal
 from torch_qpmpc.mpc.stage_cost import StageCost, fit_stage_cost
-
-
-def normal(*size: int, seed: int = 0) -> Tensor:
-    random = torch.Generator().manual_seed(seed)
-    return torch.randn(size, generator=random, dtype=torch.float64)
 
 
 def arguments(n: int = 4) -> Tensor:
