@@ -9,7 +9,7 @@ import pytest
 
 import train
 from torch_qpmpc.experiment.config import Config
-from torch_qpmpc.experiment.launch import settled
+from torch_qpmpc.experiment.launch import LOCK, settled
 from torch_qpmpc.experiment.run_folder import read_config
 from torch_qpmpc.qp.pipeline.solve import SolveLog
 
@@ -63,3 +63,9 @@ def assert_same_numbers(folder: Path, whole: Path) -> None:
     for summary in summaries:
         assert summary.pop("train_seconds") > 0
     assert summaries[0] == summaries[1]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return what is in each file of a folder, but for its lock."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
+    return {str(path): path.read_bytes() for path in files}

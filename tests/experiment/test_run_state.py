@@ -10,8 +10,8 @@ import torch
 from omegaconf import OmegaConf
 
 import train
-from tests.runs import SMALL, make_config
-from tests.stops import assert_same_numbers, begun, go_on, stop
+from tests.runs import SMALL, make_config, run_command
+from tests.stops import assert_same_numbers, begun, contents, go_on, stop
 from torch_qpmpc import QPError
 from torch_qpmpc.files import load_file, save_file
 from torch_qpmpc.mpc.state import KIND
@@ -78,6 +78,15 @@ def stopped(run: Path, tmp_path: Path) -> Path:
 def test_a_resumed_run_stops_and_resumes_again(monkeypatch, stopped, whole):
     stop(monkeypatch, make_config(), stopped, STOP)
     go_on(stopped)
+    assert_same_numbers(stopped, whole)
+
+
+def test_the_same_command_goes_on_with_a_stopped_run_and_another_does_not(stopped, whole):
+    before, command = contents(stopped), (*RUN, "eval_interval=2", f"hydra.run.dir={stopped}")
+    with pytest.raises(SystemExit, match="holds a run with updates=8, expected updates=5"):
+        run_command(*command, "updates=5")
+    assert contents(stopped) == before
+    run_command(*command)
     assert_same_numbers(stopped, whole)
 
 

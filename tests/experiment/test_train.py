@@ -2,7 +2,6 @@
 
 import json
 import math
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from hydra import compose, initialize_config_dir
 
 import train
 from tests.runs import CONFIGS, SMALL, make_config, run_command
-from tests.stops import assert_same_numbers, stop
+from tests.stops import assert_same_numbers, contents
 from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.experiment import evaluation
@@ -251,26 +250,6 @@ def test_a_mistake_on_the_command_line_is_named(tmp_path, monkeypatch, capsys, m
 TINY = (*SMALL, "task.eval_steps=5")
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
-    return {str(path): path.read_bytes() for path in files}
-
-
-@pytest.fixture(scope="module")
-def stopped_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stop a run after the checkpoint of its second update."""
-    folder = tmp_path_factory.mktemp("stopped") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        stop(patch, make_config(*TINY), folder, 3)
-    return folder
-
-
-@pytest.fixture
-def stopped(stopped_run: Path, tmp_path: Path) -> Path:
-    """Copy the stopped run."""
-    return shutil.copytree(stopped_run, tmp_path / "run")
-
-
 def test_a_finished_run_is_shown_again_and_not_overwritten(tmp_path, capsys):
     folder = tmp_path / "run"
     (folder / ".hydra").mkdir(parents=True)
@@ -289,15 +268,6 @@ def test_a_finished_run_is_shown_again_and_not_overwritten(tmp_path, capsys):
     (folder / "config.yaml").unlink()
     with pytest.raises(SystemExit, match=r"holds a run without its config\.yaml, expected a"):
         run_command(*TINY, f"hydra.run.dir={folder}")
-
-
-def test_the_same_command_goes_on_with_a_stopped_run_and_another_does_not(stopped):
-    before = contents(stopped)
-    with pytest.raises(SystemExit, match="holds a run with updates=4, expected updates=5"):
-        run_command(*TINY, "updates=5", f"hydra.run.dir={stopped}")
-    assert contents(stopped) == before
-    run_command(*TINY, f"hydra.run.dir={stopped}")
-    assert (stopped / "summary.json").exists()
 
 
 def test_the_sentence_of_a_stopped_run_has_its_command(tmp_path, monkeypatch, capsys):
