@@ -8,11 +8,10 @@ from torch.testing import assert_close
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPMPC
-from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_operator
+from torch_qpmpc.experiment.algorithms import make_learner, make_operator
 from torch_qpmpc.experiment.gating import BEST, PATIENCE, RunGate
 from torch_qpmpc.experiment.run_folder import read_metrics
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.study.runs import FinishedRun
 
 GATED = (*SMALL, "gate=true", "optimizer=gauss_newton", "batch_size=32", "steps_per_update=4")
 GATED += ("gate_interval=3",)
@@ -34,16 +33,7 @@ def test_candidates_are_judged(run):
     for row in judged.to_dict("records"):
         assert (float(row["gate/high"]) < 0) == bool(row["gate/accepted"])
     assert summary["simulated"] == 10 * 2 * judged["gate/pairs"].sum()
-
-
-def test_the_policy_that_is_kept_is_the_one_that_is_reported(run):
-    folder, summary = run
-    finished = FinishedRun(folder)
-    loop = evaluate(finished.cfg, finished.policy.policy, finished.physics)
-    assert summary["J_best"] == pytest.approx(loop.J, rel=1e-9)
     assert summary["J_best"] < summary["J_start"]
-    assert read_metrics(folder)["eval/J"].iloc[-1] == summary["J_best"]
-    assert (folder / BEST).exists()
 
 
 def make_gate(*overrides: str) -> tuple[RunGate, Any]:

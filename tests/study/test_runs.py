@@ -103,6 +103,7 @@ def gated(tmp_path_factory):
 def test_a_run_is_loaded_with_what_it_wrote(gated, tmp_path):
     run = qm.load_run(gated)
     assert run.policy.structure == run.start.structure == "tied"
+    assert run.summary["accepted"] > 0
     s = torch.ones(3, run.policy.n_p)
     assert torch.equal(run.policy.policy(s), qm.QPMPC.load(gated / "best.pt").policy(s))
     assert run.summary["J_best"] == run.metrics["eval/J"].iloc[-1]
