@@ -116,6 +116,21 @@ def test_a_row_of_p_alone_is_judged_by_its_own_terms(length):
     assert mpc.solve(torch.as_tensor(p)).solved.tolist() == [True, False]
 
 
+@pytest.mark.parametrize("levels", [{}, {"action_levels": [(-1.0, 0.2, 1.0)]}])
+def test_a_step_from_far_away_leaves_no_trace(levels):
+    """Its multipliers have more rounding than those of later steps are large."""
+    mpc = tied(4, constraint_slack=torch.inf, **levels)
+    library, _ = load(mpc)
+    p, count = draw_known(mpc, 20), 20
+    state, fresh = library.states(1), library.steps(library.states(count), p, 1)
+    assert {SOLVED, INFEASIBLE} == {*fresh.codes}
+    for i in range(count):
+        library.steps(state, 1e20 * p[i : i + 1], 1)
+        step, solved = library.steps(state, p[i : i + 1], 1), fresh.codes[i] == SOLVED
+        assert step.codes == fresh.codes[i]
+        np.testing.assert_allclose(step.u[0], fresh.u[i] if solved else step.u[0], atol=1e-9)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e308])
 def test_an_invalid_p_holds_the_last_action(bad):
     mpc = rates()

@@ -82,6 +82,7 @@ static int search(policy_state *s, policy_info *info, real *starts)
 {
     real best = BIG, limit = BIG;
     int depth = 0, nodes = 0, i, e;
+    restart(s); /* multipliers for another p may leave rounding that cuts off nodes */
     for (i = 0; i < POLICY_ROWS; i++) s->low[i] = Y_LOWER[i], s->high[i] = Y_UPPER[i];
     for (;;) {
         real cost, least = BIG, own;

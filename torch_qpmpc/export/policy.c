@@ -471,8 +471,6 @@ static int judge(const real p[], policy_info *info)
     return holds;
 }
 
-/* @LEVELS@ */
-
 /* Forget the active set, but not the last action. */
 static void restart(policy_state *s)
 {
@@ -483,6 +481,8 @@ static void restart(policy_state *s)
         s->kind[i] = FREE;
     }
 }
+
+/* @LEVELS@ */
 
 void policy_reset(policy_state *s)
 {
