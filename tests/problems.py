@@ -199,7 +199,8 @@ def certified(p: Programs, *claim: Tensor) -> tuple[Tensor, ...]:
     left = Hz + theta.q + G_lam + C_chi
     left[:, : xi.shape[-1]] += xi
     terms = Terms._make(x.contiguous().numpy() for x in (Hz, G_lam, C_chi, left, y, Cz))
-    found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *p.data(), terms)
+    qps = p.group, p.fixed, p.prepared.held(p.n_f)
+    found = sample.judge(z.numpy(), lam.numpy(), chi.numpy(), *qps, terms)
     return (*map(torch.from_numpy, found),)
 
 

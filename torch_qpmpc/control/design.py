@@ -426,7 +426,7 @@ class Design:
         They are ``(*batch, n)``, a target, with a dimension for the stages if it is `staged`,
         ``(*batch, m)`` and ``(*batch, N + 1, n_d)``.
         """
-        batch, constants = x.shape[:-1], arrays.asarray(np.append(self.nominal, [0.0, 1.0]))
+        batch, constants = x.shape[:-1], arrays.asarray(np.concatenate((self.nominal, (0.0, 1.0))))
         constants = arrays.broadcast_to(constants, (*batch, len(constants))) if batch else constants
         parts = [part.reshape(*batch, -1) for part in (x, *target, u_last, known, constants)]
         signals = arrays.concatenate(parts, -1)
@@ -499,11 +499,12 @@ class Design:
         Bounds after the horizon do not act, so that the plan would leave y_s with their part of
         y_s - r. The signals are `arranged`'s, and ``lam`` ``(*batch, n_g)`` the target's.
         """
-        if not self.pulls[1].size:
+        count = self.pulls[1].shape[1]
+        if not count or (arrays is np and not lam[..., -count:].any()):
             return r
         moved, shifts, Q = map(arrays.asarray, (*self.pulls, self.Q))
         own = (y_s - r) @ moved.T
-        pull = own + lam[..., -shifts.shape[1] :] @ shifts.T
+        pull = own + lam[..., -count:] @ shifts.T
         size, share = ((pull @ Q * x).sum(-1)[..., None] for x in (pull, own))
         return r + own - pull * (share / arrays.where(size > 0, size, 1.0)).clip(0, 1)
 

@@ -333,8 +333,7 @@ class Law:
             SolverError: its QP has no solution.
         """
         design, n_y = self.design, r.shape[1]
-        if not design.staged:
-            known = known[-1:]
+        known = known if design.staged else known[-1:]
         s = np.empty((len(known), n_y + len(w) + known.shape[1] + 1))
         s[:, :n_y] = r if design.references == "preview" else r[0]
         s[:, n_y : n_y + len(w)] = w

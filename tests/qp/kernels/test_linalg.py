@@ -51,6 +51,23 @@ def test_without_a_writable_cache_kernels_are_compiled_each_time(monkeypatch):
     assert twice(3.0) == 6.0
 
 
+def test_held_arrays_are_those_of_the_caller_until_it_lets_go():
+    @numba.njit
+    def add_one(held):
+        (x, y), _ = held.parts
+        x += 1.0
+        return x.sum() + y
+
+    x = np.zeros(3)
+    free = sys.getrefcount(x)
+    held = linalg.held(((x, 2.0), np.ones(2)))
+    assert sys.getrefcount(x) > free
+    assert (add_one(held), add_one(held)) == (5.0, 8.0)
+    np.testing.assert_array_equal(x, 2.0)
+    del held
+    assert sys.getrefcount(x) == free
+
+
 @pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (1, 6), (0, 3), (3, 0)])
 @pytest.mark.parametrize("M", [1, 3])
 def test_products_are_those_of_each_matrix(M, i, j):

@@ -37,13 +37,14 @@ MAX_STEPS, NEAR = 2000, 256
 
 
 @partial(compiled, nogil=True)
-def recall(active, group, fixed, dual, theta, reduced, sizes):
+def recall(active, group, fixed, dual, qps):
     """Solve QPs from active sets ``(B, n_g)``, complete and certify them.
 
     Returns:
         What `torch_qpmpc.qp.kernels.sample.recover` does, with one more than the number of changes
         of the set as iterations.
     """
+    _, reduced, sizes = qps.parts
     B, (r, d), w = len(fixed), reduced.G.shape[1:], reduced.w
     g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), sizes.spans[0][:0]
     g = g_l_u[:, :d].copy()
@@ -86,7 +87,7 @@ def recall(active, group, fixed, dual, theta, reduced, sizes):
         slope += transposed_products(reduced.G, group, force, spans)
         if not slope.size or np.abs(slope).max() <= EXACT * np.abs(g).max():
             break
-    return recover(v, force, steps, group, fixed, theta, reduced, sizes, np.int64(0))
+    return recover(v, force, steps, group, fixed, qps, np.int64(0))
 
 
 @compiled

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numba.core.event import Event, Listener, register
+from numba.experimental import structref
 
 #: Largest matrix size times number of vectors in one call of BLAS, which then uses one thread.
 ONE_THREAD = 2**18
@@ -45,7 +46,7 @@ class Progress(Listener):
 
         assert event.data is not None
         kernel, text = event.data["dispatcher"].py_func, "compiling for this processor, once"
-        own = kernel.__module__.startswith("torch_qpmpc") and not self._bars
+        own = f"{kernel.__module__}".startswith("torch_qpmpc") and not self._bars
         hidden = None if own else True  # None: without a terminal
         self._bars.append(tqdm(desc=text, unit=" kernels", leave=False, disable=hidden))
         self._bars[0].set_postfix_str(kernel.__name__)
@@ -56,6 +57,24 @@ class Progress(Listener):
 
 
 register("numba:compile", Progress())
+
+
+class Held(structref.StructRefProxy):
+    """``parts`` of arrays that a kernel takes as one argument, see `held`."""
+
+
+@structref.register
+class _HeldType(numba.types.StructRef):
+    pass
+
+
+structref.define_proxy(Held, _HeldType, ["parts"])
+
+
+@compiled
+def held(parts):
+    """Convert a tuple of arrays once: dozens of them take as long as a kernel in each call."""
+    return Held(parts)
 
 
 # LLVM vectorises loops whose sums may be reordered.

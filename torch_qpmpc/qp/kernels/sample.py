@@ -99,7 +99,7 @@ def offsets(fixed, group, matrix, constant):
 
 
 @partial(compiled, nogil=True)
-def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
+def recover(v, lam_v, iterations, group, fixed, qps, passes):
     """Complete and certify solutions of reduced QPs.
 
     The multipliers of C z = b and of the fixed entries follow from the stationarity of the
@@ -108,12 +108,13 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     Args:
         v, lam_v: solutions ``(B, d)`` and signed multipliers ``(B, r)`` of the reduced QPs.
         iterations: returned as they are, ``(B,)``.
-        group, fixed, theta, reduced, sizes: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
+        group, fixed, qps: the QPs, see `torch_qpmpc.qp.pipeline.batch`.
         passes: the number of iterative refinements of z and chi after the elimination.
 
     Returns:
         The parts of `BatchSolution`, SOLVED or NOT_CONVERGED.
     """
+    theta, reduced, sizes = qps.parts
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
     factors, pivots = reduced.factors, reduced.pivots
@@ -147,7 +148,7 @@ def recover(v, lam_v, iterations, group, fixed, theta, reduced, sizes, passes):
     for i in range(n_qps):
         add(left[i, :n_f], 1.0, xi[i])
     terms = Terms(Hz, G_lam, C_chi, left, y, Cz)
-    value, residual, error = judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms)
+    value, residual, error = judge(z, lam, chi, group, fixed, qps, terms)
     status = np.full(n_qps, NOT_CONVERGED)
     for i in range(n_qps):
         if residual[i] <= TOLERANCE and error[i] <= TOLERANCE:
@@ -191,7 +192,7 @@ def _all_multipliers(lam_v, y, theta, rows, others):
 
 
 @compiled
-def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
+def judge(z, lam, chi, group, fixed, qps, terms):
     """Certify z, lam and chi with their KKT `Terms`.
 
     Returns:
@@ -200,16 +201,15 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
         of its terms; or, if larger, the sum of the errors in C z = b, weighted by |chi|, and of the
         rows' complementarity gaps, relative to the cost.
     """
+    theta, reduced, sizes = qps.parts
     Hz, G_lam, C_chi, left, y, Cz = terms
-    H, C, G = theta.H, theta.C, theta.G
-    q, c, b, lb, ub, w = theta.q, theta.c, theta.b, theta.lb, theta.ub, theta.w
+    H, C, G, q, c, b, lb, ub, w = theta
     n_f = fixed.shape[1]
     slopes = transposed_products(reduced.T, group, left, sizes.spans[3])
     value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
     d = reduced.H.shape[1]
     basis, ends, slacks = np.empty((d + 1, d)), np.empty(d + 1), np.empty(d + 1)
     inverse, shift, box, hard = sizes.inverse, sizes.shift, sizes.box, sizes.hard
-    apart = sizes.apart
     for i in range(len(z)):
         q_i, b_i, m = q[i % len(q)], b[i % len(b)], group[i]
         H_m, C_m, G_m = H[m % len(H)], C[m % len(C)], G[m % len(G)]
@@ -242,15 +242,16 @@ def judge(z, lam, chi, group, fixed, theta, reduced, sizes, terms):
             curved = (inverse[m], reduced.H[m])
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
             of_slope = split if split < of_slope else of_slope
-            slope = _transposed(reduced.T[m % len(reduced.T)], Hz[i], q_i)[n_f:]
+            own, cost_slope = group[i : i + 1], (Hz[i] + q_i).reshape(1, -1)
+            slope = transposed_products(reduced.T, own, cost_slope, sizes.spans[3])[0, n_f:]
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
             factors = (reduced.factors, reduced.pivots, sizes.spans[4])
-            free_chi = multipliers(*factors, group[i : i + 1], (Hz[i] + q_i).reshape(1, -1))[0]
+            free_chi = multipliers(*factors, own, cost_slope)[0]
             split += charge + _shortage(Cz[i], b_i, free_chi)
             if split < gap + of_slope:
                 gap, of_slope = 0.0, split
         rows = (y[i], lam[i], lb_i, ub_i, w_i, steps)
-        if apart:
+        if sizes.apart:
             step = _repair_apart(rows, hard, z[i], G_m)
         else:
             step = _repair(rows, hard, z[i], G_m, sizes.units[m], basis, ends, slacks)
@@ -337,15 +338,6 @@ def _fall(slope, lb, ub, w, far, inverse, shift, steps, box):
     fall = 0.5 * (_square(inverse, slope) + (shift * length if shift > 0 else 0.0))
     # A NaN in fall stays.
     return (linear if linear < fall else fall), math.sqrt(square)
-
-
-@compiled
-def _transposed(matrix, Hz, q):
-    """Return ``matrix'(Hz + q)``."""
-    product = np.zeros(matrix.shape[1])
-    for j in range(len(q)):
-        add(product, Hz[j] + q[j], matrix[j])
-    return product
 
 
 @compiled

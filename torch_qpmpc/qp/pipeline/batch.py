@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.qp.kernels import active_set, sample
+from torch_qpmpc.qp.kernels.linalg import Held, held
 from torch_qpmpc.qp.pipeline.arrays import (
     BackendSolution,
     BatchSolution,
@@ -138,6 +139,11 @@ class Prepared:
         """Return the `Dual` of the reduced QPs, see `condensing.dual`."""
         _, _, H, G, *_ = self.reduced(n_f)
         return dual(H, G, least)
+
+    @kept
+    def held(self, n_f: int) -> Held:
+        """Return theta, the reduced QPs and their sizes as one argument of kernels."""
+        return held((self.theta, self.reduced(n_f), self.sizes(n_f)))
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""
@@ -294,7 +300,6 @@ class Programs:
     def valid(self) -> np.ndarray | None:
         """Return the mask of QPs with valid data, ``(B,)``; None if all are valid."""
         valid = self.prepared.valid
-        # A sum is finite if its terms are (except on overflow, which no solver survives either).
         if valid is None and np.isfinite(float(self.fixed.sum())):
             return None
         finite = np.isfinite(self.fixed.sum(-1))
@@ -317,8 +322,8 @@ class Programs:
         The warm start of every solver, for the whole batch at once. Codes are those of
         `QPSolution.active`; a set with any other code starts as one of a similar QP before.
         """
-        (group, fixed, *qps), dual = self.data(), self.prepared.dual(self.n_f)
-        return self._in_threads(active_set.recall, (active, group, fixed), dual, *qps)
+        dual, qps = self.prepared.dual(self.n_f), self.prepared.held(self.n_f)
+        return self._in_threads(active_set.recall, (active, self.group, self.fixed), dual, qps)
 
     def recover(self, candidate: BackendSolution, passes: int = 0) -> BatchSolution:
         """Complete a backend's solutions of the `reduced_qps`, and certify them.
@@ -326,8 +331,8 @@ class Programs:
         ``passes`` iterative refinements of z and chi reduce errors of an ill-conditioned
         elimination.
         """
-        group, fixed, *qps = self.data()
-        return self._in_threads(sample.recover, (*candidate, group, fixed), *qps, passes)
+        rows = *candidate, self.group, self.fixed
+        return self._in_threads(sample.recover, rows, self.prepared.held(self.n_f), passes)
 
     def _in_threads(self, kernel: Callable, rows: Sequence[np.ndarray], *qps: Any) -> BatchSolution:
         """Run a kernel; many QPs of one theta take torch's number of threads."""
@@ -339,11 +344,6 @@ class Programs:
             split = (np.array_split(x, parts) for x in rows)
             found = pool.map(lambda *part: kernel(*part, *qps), *split)
             return BatchSolution._make(map(np.concatenate, zip(*found, strict=True)))
-
-    def data(self) -> tuple:
-        """Return the kernels' arguments after the candidate."""
-        prepared, n_f = self.prepared, self.n_f
-        return self.group, self.fixed, self.theta, prepared.reduced(n_f), prepared.sizes(n_f)
 
 
 def _flattened(x: Tensor, batch: torch.Size, event: Sequence[int]) -> Tensor:

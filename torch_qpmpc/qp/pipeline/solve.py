@@ -19,12 +19,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import flatten_batch
-from torch_qpmpc.qp.pipeline.arrays import (
-    LONG,
-    BatchSolution,
-    SoftQPs,
-    to_numpy,
-)
+from torch_qpmpc.qp.pipeline.arrays import LONG, BatchSolution, SoftQPs, to_numpy
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
