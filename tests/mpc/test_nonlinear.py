@@ -208,6 +208,34 @@ def test_a_saddle_says_that_the_plan_has_no_gradient():
         mpc.policy(s)
 
 
+@pytest.mark.parametrize("hard", [True, False])
+@pytest.mark.parametrize("units", [(1e-6, 1e5, 1e4), (1e5, 1e-6, 1.0), (1.0, 1e4, 1e-8)])
+def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):
+    bounds = {"state_bounds": ([-1.0, -2.0], [3.0, 2.0]), "action_bounds": ([-1.5], [1.5])}
+    s = torch.tensor([[2.5, 0.0], [0.5, -1.0], [-0.9, 0.2]], dtype=torch.float64)
+
+    def found(x_unit: float, u_unit: float, cost: float) -> tuple[Tensor, ...]:
+        plant, sizes = Pendulum(), {"state_bounds": x_unit, "action_bounds": u_unit}
+        own = {k: [[x * sizes[k] for x in side] for side in v] for k, v in bounds.items()}
+        weight = [cost / x_unit**2, 0.1 * cost / x_unit**2, 0.1 * cost / u_unit**2]
+        own |= {"stage_weight": weight, "state_slack": torch.inf if hard else 5 * cost / x_unit}
+
+        def dynamics(x: Tensor, u: Tensor) -> Tensor:
+            return plant(x / x_unit, u / u_unit) * x_unit
+
+        mpc = QPMPC.of(2, 1, 15, dynamics=dynamics, solver="daqp", learn=(), **own)
+        p = (s * x_unit).requires_grad_()
+        solution = mpc.solve(p)
+        assert isinstance(solution, PlanSolution)
+        assert solution.converged.all()
+        assert solution.strict is not None
+        assert solution.strict.all()
+        (slope,) = torch.autograd.grad(mpc.policy(p).sum(), p)
+        return solution.value / cost, solution.plan / u_unit, slope * x_unit / u_unit
+
+    assert_close(found(*units), found(1.0, 1.0, 1.0), rtol=1e-5, atol=1e-6)
+
+
 def test_a_plan_is_an_argument_and_a_result():
     mpc: Any = made(iterations=1)
     s = states(mpc, size=1.5)

@@ -1,4 +1,5 @@
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -136,7 +137,7 @@ def test_second_derivative_of_the_value_in_every_operand(name):
     assert_close((finite * direction).sum(), central, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("length", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("length", [1e-8, 1.0, 1e8, 10.0 ** torch.arange(-9, 9, 3).double()])
 @pytest.mark.parametrize("cost", [1e-12, 1e-8, 1.0, 1e8])
 def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
     """With a cost of 1e-8 a multiplier is small, but not rounding: its row is active."""
@@ -145,9 +146,10 @@ def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
     w = torch.tensor([torch.inf] * 3 + [4.0] * 3, dtype=torch.float64)
     C, box = normal(1, 6), torch.full((6,), 0.5, dtype=torch.float64)
 
-    def in_units(q: Tensor, cost: float, length: float) -> Tensor:
+    def in_units(q: Tensor, cost: float, length: Any) -> Tensor:
+        length = torch.as_tensor(length, dtype=torch.float64).expand(6)
         qp = QuadraticProgram(
-            H=H * cost / length**2,
+            H=H * cost / length.outer(length),
             q=q * cost / length,
             C=C / length,
             b=torch.zeros(1, dtype=torch.float64),

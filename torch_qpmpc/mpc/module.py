@@ -188,9 +188,8 @@ class QPMPC(nn.Module):
         self._block_ndims = [theta[name].ndim for name in ("H", "H_f")]
         for name, start in theta.items():
             if name in self.learned:
-                parameters.attach(
-                    self, name, start.clone(), self._parametrizations_for(name, start)
-                )
+                own = self._parametrizations_for(name, start)
+                parameters.attach(self, name, start.clone(), own)
             else:
                 self.register_buffer(name, start.clone())
 

@@ -46,8 +46,9 @@ FRACTIONS = (1.0, 0.5, 0.2, 0.04)
 FIRST, LEAST, MOST, CHANGE = 1e-2, 1e-9, 1e4, 4.0
 #: A converged plan's step, and a rise of the cost that is rounding, relatively; too large a state.
 SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
-#: The price of a hard row's violation, relative to its largest multiplier.
-PRICE = 2.0
+#: The price of a hard row's violation: relative to its largest multiplier, and before there is one
+#: to the cost of a violation by the row's bound.
+PRICE, FIRM = 2.0, 0.3
 #: The least eigenvalue of a definite Hessian, relatively.
 DEFINITE = 1e-9
 #: The parts of a `QPSolution` besides its QP.
@@ -296,15 +297,17 @@ class SequentialQP(nn.Module):
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
         hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G[..., of_x] != 0).any(-1)))
         of_u, hard = hard & ~moved, hard & moved  # those of u alone no plan may violate
-        price = torch.where(qp.w.isinf(), 1.0, qp.w).expand(B, -1).clone()
+        price, sides = torch.where(qp.w.isinf(), 0.0, qp.w), torch.stack((qp.lb, qp.ub)).abs()
+        bound = torch.where(sides.isfinite(), sides, 0.0).amax(0)
+        bound = torch.where(bound > 0, bound, 1.0).expand(B, -1)
 
         def merit(index: Tensor, z: Tensor, costs: Tensor) -> Tensor:
             """Return the cost of z ``(len(index), K, n_z)`` with the prices of violations."""
             own = _taken(qp, index, 1)
             y = times(own.G, z)
             over = torch.maximum(own.lb - y, y - own.ub).relu()
-            far = (over > ROUNDING**0.5) & of_u[index].unsqueeze(1)
-            over = (price[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
+            far = (over > ROUNDING**0.5 * bound[index].unsqueeze(1)) & of_u[index].unsqueeze(1)
+            over = (price.expand(B, -1)[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
             costs = costs + over.sum(-1) + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
             return costs.nan_to_num(torch.inf, torch.inf, torch.inf)
 
@@ -314,6 +317,8 @@ class SequentialQP(nn.Module):
             tries[:, :, 0] = fixed[:, None, n_p:]
         tries = tries[:, :, self.held]
         z, costs = self.simulated(p.unsqueeze(1), tries)
+        least = merit(every, z, costs).amin(1, keepdim=True).abs()
+        price = torch.where(hard, FIRM * least.nan_to_num(posinf=1.0) / bound, price)
         best = merit(every, z, costs).argmin(1)
         u, z, costs = (x[every, best] for x in (tries, z, costs))
         z[~(z.abs() < OVERFLOW).all(1), n_p:] = 0.0
@@ -324,7 +329,9 @@ class SequentialQP(nn.Module):
                 break
             near = self.along(_taken(qp, todo), z[todo])
             size = near.H.diagonal(dim1=1, dim2=2)
-            size = pull[todo, None] * size.maximum(1e-3 * size.mean(1, keepdim=True)).clamp(1e-12)
+            of_after = layout.predicted(size)[0][:, 1:].flatten(1)
+            of_before = times(near.C[:, : len(self.C)].mT.square(), of_after)
+            size = pull[todo, None] * size.maximum(1e-3 * of_before)
             near.H.diagonal(dim1=1, dim2=2).add_(size)
             near.q.sub_(size * z[todo])
             near.c.add_((size * z[todo] ** 2).sum(-1) / 2)
@@ -341,11 +348,14 @@ class SequentialQP(nn.Module):
             found = self.simulated(p[todo].unsqueeze(1), tries)
             before = merit(todo, z[todo].unsqueeze(1), costs[todo].unsqueeze(1))[:, 0]
             after, best = merit(todo, *found).min(1)
-            better = solved & after.isfinite() & (after <= before + ROUNDING * (1 + before.abs()))
+            scale = before.abs() + (z[todo] * times(near.H, z[todo])).sum(-1)
+            better = solved & after.isfinite() & (after <= before + ROUNDING * scale)
+            small = (step.abs().amax(1) <= SETTLED * u[todo].abs().amax(1)).all(1)
+            change = solution.z - z[todo]
+            small |= (change * times(near.H, change)).sum(-1) <= ROUNDING**2 * scale
             for own, new in zip((u, z, costs), (tries, *found), strict=True):
                 own[todo[better]] = new[among, best][better]
-            size = step.abs().amax((1, 2)) / (1 + u[todo].abs().amax((1, 2)))
-            converged[todo] = solved & (size <= SETTLED) & (pull[todo] <= 1)
+            converged[todo] = solved & small & (pull[todo] <= 1)
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
             done[todo] = ~solved | converged[todo] | (pull[todo] > MOST)
@@ -443,8 +453,12 @@ def _strict(qp: QuadraticProgram, fixed: Tensor, known: Sequence[Tensor]) -> Ten
     programs, _ = Programs.of(*theta, fixed.detach(), n_kept=n_f)
     condensed = programs.prepared.condensed(n_f)
     H, G = (to_tensor(x[:, :, n_f:])[programs.group] for x in (condensed.H, condensed.G))
-    H, rows = H[:, n_f:], torch.where(active_rows(lam, *theta[6:])[0].unsqueeze(-1), G, 0)
-    free = torch.eye(H.shape[-1]).to(H) - torch.linalg.pinv(rows) @ rows
-    size = H.abs().amax((1, 2), keepdim=True)
-    values = torch.linalg.eigvalsh(free @ H @ free + size * (torch.eye(H.shape[-1]).to(H) - free))
-    return values[:, 0] > DEFINITE * size[:, 0, 0]
+    size = H[:, n_f:].diagonal(dim1=1, dim2=2).abs().sqrt()  # units in which no other has a part
+    size = torch.where(size > 0, size, 1.0).unsqueeze(1)
+    H, G = H[:, n_f:] / size / size.mT, G / size
+    force = G.norm(dim=-1)
+    held = active_rows(lam * force, *theta[6:8], theta[8] * force)[0]
+    rows = torch.where(held.unsqueeze(-1), F.normalize(G, dim=-1), 0)
+    kept = torch.linalg.pinv(rows) @ rows
+    free = torch.eye(H.shape[-1]).to(H) - kept
+    return torch.linalg.eigvalsh(free @ H @ free + kept)[:, 0] > DEFINITE

@@ -108,9 +108,8 @@ def groups(
     for part in learned:
         rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
         if rate is None:
-            raise QPError.expected(
-                "rates", f"nothing for {part}", "a rate for every learned part, or its family"
-            )
+            want = "a rate for every learned part, or its family"
+            raise QPError.expected("rates", f"nothing for {part}", want)
         check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
         result.append({"params": leaves(module, part), "lr": rate, "name": part})
     if "dynamics" in rates and (own := list(getattr(module.sequential, "parameters", list)())):

@@ -49,16 +49,13 @@ def riccati_weight(A: Tensor, B: Tensor, W: Tensor, gamma: float = 1.0) -> Tenso
     n_x, root, W = A.shape[-1], gamma**0.5, (W + W.mT) / 2  # SciPy allows W no rounding
     Q, S, R = W[:n_x, :n_x], W[:n_x, n_x:], W[n_x:, n_x:]
     try:
-        P = scipy.linalg.solve_discrete_are(
-            *(x.detach().numpy() for x in (root * A, root * B, Q, R)), s=S.detach().numpy()
-        )
+        parts = (x.detach().numpy() for x in (root * A, root * B, Q, R))
+        P = scipy.linalg.solve_discrete_are(*parts, s=S.detach().numpy())
     except (ValueError, scipy.linalg.LinAlgError) as error:
-        raise QPError.expected(
-            "terminal_weight",
-            f"a Riccati equation without a solution ({error})",
-            "a stabilisable model and a positive definite weight of the actions",
-            "Give the actions some weight, or pass a matrix.",
-        ) from error
+        got = f"a Riccati equation without a solution ({error})"
+        want = "a stabilisable model and a positive definite weight of the actions"
+        remedy = "Give the actions some weight, or pass a matrix."
+        raise QPError.expected("terminal_weight", got, want, remedy) from error
     return torch.as_tensor((P + P.T) / 2).to(A)
 
 

@@ -200,14 +200,8 @@ def _best_convex(seen: _Observed, block: Tensor) -> Tensor:
     # Not at a root of zero, where the gradient is zero.
     start = eigenvalues.clamp(min=FLOOR * eigenvalues.abs().amax()).sqrt()
     root = (vectors * start).contiguous().requires_grad_()
-    optimizer = torch.optim.LBFGS(
-        [root],
-        max_iter=ITERATIONS,
-        tolerance_grad=TOLERANCE,
-        tolerance_change=0.0,
-        history_size=50,
-        line_search_fn="strong_wolfe",
-    )
+    ends = {"max_iter": ITERATIONS, "tolerance_grad": TOLERANCE, "tolerance_change": 0.0}
+    optimizer = torch.optim.LBFGS([root], **ends, history_size=50, line_search_fn="strong_wolfe")
 
     def closure() -> Tensor:
         optimizer.zero_grad()

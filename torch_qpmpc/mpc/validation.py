@@ -28,11 +28,8 @@ CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 def check_learn(learn: Collection[str], structure: str, n_linear: int) -> None:
     """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn."""
     parts = (*COST, *CONSTRAINTS)
-    if (
-        not isinstance(learn, Collection)
-        or isinstance(learn, str)
-        or not all(isinstance(part, str) and part in parts for part in learn)
-    ):
+    several = isinstance(learn, Collection) and not isinstance(learn, str)
+    if not several or not all(isinstance(part, str) and part in parts for part in learn):
         expected = f"a collection of names among {', '.join(parts)}"
         raise QPError.expected("learn", repr(learn), expected)
     if "G" in learn and structure != "free" and not n_linear:

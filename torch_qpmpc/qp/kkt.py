@@ -62,23 +62,31 @@ def solve_kkt(*arguments: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     fixed = fixed.expand(*batch, fixed.shape[-1])
     programs, batch = Programs.of(*theta, fixed, n_kept=n_kept)
     solved = (status == Status.SOLVED).expand(batch).reshape(-1)
-    which, solvable = slice(None), programs
-    if not solved.all():
-        which = solved.nonzero().squeeze(-1)
-        solvable = programs.take(which.numpy())
+    which = solved.nonzero().squeeze(-1)
+    solvable = programs if solved.all() else programs.take(which.numpy())
 
     def flat(x: Tensor) -> Tensor:
         return flatten_batch(x.expand(*batch, x.shape[-1]))[which].double()
 
-    right = flat(grad_z), flat(grad_lam), flat(grad_chi), flat(grad_xi)
-    solutions = _solve_kkt(solvable, *right, flat(z), flat(lam)) if len(solvable) else ()
+    solutions = _solve_in_units(solvable, *map(flat, vectors[:6])) if len(solvable) else ()
     like = z, theta[4], lam, fixed
     results = tuple(z.new_zeros(len(solved), x.shape[-1]) for x in like)
     for x, solution in zip(results, solutions, strict=False):
         x[which] = solution.to(x)
-    like = tensors[4]
-    p, r, t, u = (x.reshape(*batch, x.shape[-1]).to(like.device) for x in results)
+    p, r, t, u = (x.reshape(*batch, x.shape[-1]).to(tensors[4].device) for x in results)
     return p, r, t, u
+
+
+def _solve_in_units(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
+    """Return `_solve_kkt` of QPs in their own units: zero and equal are relative to these."""
+    if (units := programs.prepared.units) is None:
+        return _solve_kkt(programs, *vectors)
+    cost, z, rows, equalities = map(to_tensor, units.per_qp(units.group))
+    fixed = z[:, : programs.n_f]
+    sizes = z, cost / rows, cost / equalities, cost / fixed, 1 / z, rows / cost
+    scaled = (x * size for x, size in zip(vectors, sizes, strict=True))
+    p, r, t, u = _solve_kkt(programs.scaled(), *scaled)
+    return p * (z / cost), r / equalities, t / rows, u / fixed
 
 
 def _solve_kkt(
@@ -114,9 +122,6 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     variable have no part in the KKT system.
     """
     lb, ub, w = map(to_tensor, programs.theta[6:9])
-    if (units := programs.prepared.units) is not None:  # zero and equal are relative to these
-        cost, _, rows, _ = map(to_tensor, units.per_qp(units.group))
-        y, lb, ub, lam, w = y / rows, lb / rows, ub / rows, lam * (rows / cost), w * (rows / cost)
     held, saturated = active_rows(lam, lb, ub, w)
     condensed = programs.prepared.condensed(programs.n_f)
     entering = to_tensor(condensed.enters[:, programs.n_f :].any(-1))
@@ -189,8 +194,7 @@ def _solve_active(
     unit, rows = unit[group], to_tensor(programs.prepared.reduced(programs.n_f).rows)
     v, t, of_v, of_t = torch.zeros_like(right_v), torch.zeros_like(right_t), right_v, right_t
     held, size = active[:, rows], largest(right_v) * 0
-    terms = size
-    regular = size < 0
+    terms, regular = size, size < 0
     for _ in range(PASSES):
         free, change = multiply(inverse, group, of_v), multiply(to_v, group, of_v)
         change = change - of_t[:, rows] / unit
@@ -261,12 +265,9 @@ class Opaque(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple:
-        raise QPError.expected(
-            "derivative",
-            "the second of the solution, or the third of the value",
-            "at most the first of the solution, or the second of the value",
-            "Detach the tensors that need no gradient.",
-        )
+        got = "the second of the solution, or the third of the value"
+        want = "at most the first of the solution, or the second of the value"
+        raise QPError.expected("derivative", got, want, "Detach the tensors that need no gradient.")
 
     @staticmethod
     def jvp(ctx: Any, *_: Tensor) -> tuple:

@@ -55,12 +55,11 @@ class Units(NamedTuple):
         """Return the units of theta; None if all of them are one."""
         if not len(group) or not theta.q.shape[-1]:
             return None
-        if (own := cls.of_columns(theta, group)) is not None:
-            units = cls.of_rows_and_cost(own.scaled(theta), group)
-            if units is None:
-                return own
-            return units._replace(length=units.length * own.length[units.triple])
-        return cls.of_rows_and_cost(theta, group)
+        own = cls.of_columns(theta, group)
+        units = cls.of_rows_and_cost(theta if own is None else own.scaled(theta), group)
+        if own is None or units is None:
+            return units or own
+        return units._replace(length=units.length * own.length[units.triple])
 
     @classmethod
     @np.errstate(all="ignore")
