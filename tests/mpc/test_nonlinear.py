@@ -303,6 +303,21 @@ def test_actions_are_within_hard_bounds_whatever_the_plan_was(low, high, iterati
         assert (u <= high[0] + 1e-6).all()
 
 
+def test_a_state_from_which_every_plan_leaves_the_region_of_the_dynamics_has_no_plan():
+    """The angle after this rate is above one, whatever the torque; from there on f is NaN."""
+    plant = Pendulum()
+
+    def limited(x: Tensor, u: Tensor) -> Tensor:
+        return torch.where(x[..., :1] > 1, torch.nan, plant(x, u))
+
+    mpc = made(dynamics=limited, on_failure="mask", learn=())
+    solution = mpc.solve(torch.tensor([[0.5, 0.0], [0.95, 3.0]], dtype=torch.float64))
+    assert solution.solved.tolist() == [True, False]
+    assert solution.converged.tolist() == [True, False]
+    with pytest.raises(QPError, match="no certified solution"):
+        made(dynamics=limited, learn=()).predict([0.95, 3.0])
+
+
 def test_actions_satisfy_hard_rows_of_several_actions():
     rows = {"constraints": ([[0.0, 1.0, 1.0]], [-torch.inf], [-3.0]), "solver": "daqp"}
     mpc = QPMPC.of(1, 2, 5, dynamics=bent, stage_weight=[1.0, 0.1, 0.1], **rows)
@@ -383,6 +398,11 @@ def test_what_needs_one_model_refuses_dynamics():
 @refused(
     ({"dynamics": 3}, "dynamics: got 3, expected a function"),
     ({"dynamics": lambda x, u: x[0]}, ".*x\\+ and l of shapes"),
+    ({"dynamics": lambda x, u: torch.stack((x[0], x[1]))}, ".*x\\+ and l of shapes"),
+    ({"dynamics": lambda x, u: (x + u).detach()}, ".*without a gradient"),
+    ({"dynamics": lambda x, u: (x + u).numpy()}, ".*of tensors .* in float64"),
+    ({"dynamics": lambda x, u: nn.Linear(2, 2)(x) + u}, ".*same dtype.*double"),
+    ({"dynamics": lambda x, u: x.sqrt() + u}, ".*NaN or inf at the origin"),
     ({"dynamics": lambda x, u: (x, x)}, ".*x\\+ and l of shapes"),
     ({"iterations": 0}, "iterations: got 0"),
     ({"learn": ("C",)}, "learn: got 'C' beside dynamics"),

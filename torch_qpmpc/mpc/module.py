@@ -207,7 +207,10 @@ class QPMPC(nn.Module):
         """
         own = {x: options.pop(x) for x in (*KEYWORDS, *MODELS) if x in options}
         if own.get("dynamics") is not None and options.get("A") is None:
-            options |= linearised(own["dynamics"], Layout(n_x, n_u, 1, n_d))
+            options |= (parts := linearised(own["dynamics"], Layout(n_x, n_u, 1, n_d)))
+            if not all(x.isfinite().all() for x in parts.values()):
+                got, want = "x+ or a slope with NaN or inf at the origin", "finite ones"
+                raise QPError.expected("dynamics", got, want, "Or pass A and B of another point.")
         return cls(Scheme.of(n_x, n_u, horizon, n_d, **options), **own)
 
     @classmethod
@@ -561,12 +564,8 @@ class QPMPC(nn.Module):
             getattr(self.get_submodule(owner), leaf).data.copy_(start.detach())
 
     def extra_repr(self) -> str:
-        prefix = f"n_d={self.n_d}, " if self.n_d else ""
-        return (
-            f"n_x={self.n_x}, n_u={self.n_u}, horizon={self.horizon}, "
-            f"{prefix}hessian={self.hessian!r}, structure={self.structure!r}, "
-            f"learned={self.learned}, solver={self.solver!r}"
-        )
+        names = ["n_x", "n_u", "horizon", *["n_d"] * bool(self.n_d), "hessian", "structure"]
+        return ", ".join(f"{x}={getattr(self, x)!r}" for x in (*names, "learned", "solver"))
 
     @property
     def constants(self) -> dict[int, float]:
@@ -650,10 +649,8 @@ class QPMPC(nn.Module):
         warm_start: QPSolution | Tensor | None = None,
         on_failure: str | None = None,
     ) -> QPSolution:
-        if qp is None:
-            qp = self.quadratic_program()
-        else:
-            check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
+        qp = self.quadratic_program() if qp is None else qp
+        check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or omit it.")
         n_kept = self.n_p + self.n_u  # V, Q and the policy share one elimination
         fixed = fixed.to(qp.C.dtype)
         on_failure = on_failure or self.on_failure

@@ -33,7 +33,7 @@ from torch_qpmpc.qp.batching import times
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import report
-from torch_qpmpc.qp.program import NDIMS, QuadraticProgram
+from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
 from torch_qpmpc.qp.solution import QPSolution, active_rows
 from torch_qpmpc.qp.solve import Eager, solve
 from torch_qpmpc.qp.tracing import is_eager
@@ -154,11 +154,20 @@ class SequentialQP(nn.Module):
         self.sizes = layout.n_d, layout.n_x, layout.n_u
         zero = torch.zeros(layout.n_x, layout.n_d + layout.n, dtype=torch.float64)
         E, A, B = zero.split(self.sizes, -1)
-        after, cost = self.stage(*zero.expand(2, -1, -1).split(self.sizes, -1))
-        shapes = tuple(after.shape), (2, len(zero)) if cost is None else tuple(cost.shape)
-        if shapes != (want := ((2, *A.shape), (2, len(zero)))):
-            remedy = "Index the last dimension: x[..., 0]."
-            raise QPError.expected("dynamics", f"x+ and l of shapes {shapes}", f"{want}", remedy)
+        w = zero.expand(len(A) + 1, -1, -1).clone().requires_grad_()
+        shapes = [(len(w), *A.shape), (len(w), len(A))]
+        try:
+            with torch.enable_grad():
+                after, cost = self.stage(*w.split(self.sizes, -1))
+            got, sloped = [tuple(after.shape), *shapes[1:]], after.requires_grad
+            got = got if cost is None else [got[0], tuple(cost.shape)]
+        except (AttributeError, RuntimeError, TypeError) as error:
+            want, remedy = "a function of tensors (*batch, n) in float64", "Make networks double()."
+            raise QPError.expected("dynamics", repr(error), want, remedy) from error
+        if got != shapes or not sloped:
+            what = f"x+ and l of shapes {got}" if sloped else "x+ without a gradient"
+            remedy = "Index the last dimension, x[..., 0], and do not detach."
+            raise QPError.expected("dynamics", what, f"{shapes}, with a gradient", remedy)
         k = torch.arange(layout.horizon)
         d, plan = (first + n * k for first, n in ((0, layout.n_d), (layout.n_preview, layout.n)))
         columns = [x.unsqueeze(1) + torch.arange(n) for x, n in ((d, layout.n_d), (plan, layout.n))]
@@ -321,7 +330,8 @@ class SequentialQP(nn.Module):
         price = torch.where(hard, FIRM * least.nan_to_num(posinf=1.0) / bound, price)
         best = merit(every, z, costs).argmin(1)
         u, z, costs = (x[every, best] for x in (tries, z, costs))
-        z[~(z.abs() < OVERFLOW).all(1), n_p:] = 0.0
+        far = ~(z.abs() < OVERFLOW).all(1)
+        z[far, n_p:], costs[far] = 0.0, torch.inf
         pull, parts = fixed.new_full((B,), FIRST), []
         converged, done = torch.zeros(2, B, dtype=torch.bool)
         for _ in range(self.iterations):
@@ -355,13 +365,14 @@ class SequentialQP(nn.Module):
             small |= (change * times(near.H, change)).sum(-1) <= ROUNDING**2 * scale
             for own, new in zip((u, z, costs), (tries, *found), strict=True):
                 own[todo[better]] = new[among, best][better]
-            converged[todo] = solved & small & (pull[todo] <= 1)
+            converged[todo] = solved & small & (pull[todo] <= 1) & before.isfinite()
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
             done[todo] = ~solved | converged[todo] | (pull[todo] > MOST)
         left = (~converged & (parts[5] == 0)).nonzero().squeeze(1)  # the plan in place of the QP's
         parts[0][left] = merit(left, z[left].unsqueeze(1), costs[left].unsqueeze(1))[:, 0]
         parts[1][left] = z[left]
+        parts[5][left[parts[0][left].isinf()]] = int(Status.INVALID_DATA)
         return u, tuple(parts), converged
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:

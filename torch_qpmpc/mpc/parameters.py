@@ -179,13 +179,10 @@ class Leaves:
     def unchanged(self, module: nn.Module) -> bool:
         """Return True if ``module`` has the same modules, tensors and content."""
         walked = _walked(module)
-        return (
-            self.known
-            and len(walked) == len(self._walked)
-            and all(map(operator.is_, walked, self._walked))
-            and all(x.data_ptr() == at and x._version == n for x, at, n in self._states)
-            and all(starmap(equal, self._contents))
-        )
+        same = self.known and len(walked) == len(self._walked)
+        same = same and all(map(operator.is_, walked, self._walked))
+        same = same and all(x.data_ptr() == at and x._version == n for x, at, n in self._states)
+        return same and all(starmap(equal, self._contents))
 
 
 def _walked(module: nn.Module) -> list[Any]:

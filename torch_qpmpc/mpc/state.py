@@ -76,9 +76,8 @@ def check_own(what: str, mpc: Any) -> None:
     """
     for name in getattr(mpc, "parametrizations", ()):
         attached = mpc.get_submodule(f"parametrizations.{name}").children()
-        if [type(x) for x in attached] != [
-            type(x) for x in mpc._parametrizations_for(name, getattr(mpc, name).detach())
-        ]:
+        own = mpc._parametrizations_for(name, getattr(mpc, name).detach())
+        if [*map(type, attached)] != [*map(type, own)]:
             got = f"a parametrization of {name} that is not QPMPC's own"
             remedy = "Save the state_dict, or remove_parametrizations first."
             raise QPError.expected(what, got, "QPMPC's own", remedy)
@@ -101,14 +100,8 @@ def reduce(mpc: Any) -> tuple:
     return _rebuild, (plain, mpc.scheme, mpc._options(), state, frozen, mpc.training)
 
 
-def _rebuild(
-    cls: type[nn.Module],
-    scheme: Scheme,
-    options: dict[str, Any],
-    state: dict[str, Tensor],
-    frozen: list[str],
-    training: bool,
-) -> nn.Module:
+def _rebuild(cls: type[nn.Module], scheme: Scheme, *content: Any) -> nn.Module:
+    options, state, frozen, training = content
     module = cls(scheme, **options)
     module.load_state_dict(state, assign=True)
     for name in frozen:
