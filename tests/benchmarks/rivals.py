@@ -12,6 +12,7 @@ Each design knows the log, the cost and the input's bounds, and nothing else of 
   (de Koning, Automatica 1982), clipped to the bounds.
 - ``two numbers``: ``mean`` with the set-point and the input's weight of least cost in simulated
   loops of the identified, noisy models.
+- ``expanded``: ``mean`` with the regulator's cost, that of the output in noise to second order.
 - ``improve``: q and the soft bound by gradients through the same loops, from ``mean``.
 - ``improve, H``: the weights, too.
 - ``Q-learning``: half of the transitions are its log, and it collects the others.
@@ -26,7 +27,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -280,12 +281,13 @@ def simulated_cost(plant: Any, policy: Callable[[Tensor], Tensor], seed: int) ->
 
 
 class Regulator(NamedTuple):
-    """u = u_s - K (x - x_s), and the standard deviation of the output in its loops."""
+    """u = u_s - K (x - x_s), the output's standard deviation in its loops, and its `Price`."""
 
     K: np.ndarray
     x_s: np.ndarray
     u_s: float
     std: float
+    price: Price
 
     def policy(self, plant: Priced) -> Callable[[Tensor], Tensor]:
         """Return the regulator, clipped to the bounds of the plant's input."""
@@ -338,7 +340,9 @@ def regulator(plant: Priced, found: Identified) -> Regulator:
         if not grown < 1e3 * S[0, 0] ** 0.5:  # no gain holds such noise in the mean square
             break
         std = grown
-    return Regulator(K, v_s[:-1], float(v_s[-1]), std)
+    slope = (mean(m + h, 0.0, std) - mean(m - h, 0.0, std)) / (2 * h)
+    price = Price(m - slope * h**2 / w, w / h**2 / 2, 0.0, 0.0, 0.0, plant.price.effort)
+    return Regulator(K, v_s[:-1], float(v_s[-1]), std, price)
 
 
 def _growth(found: Identified) -> np.ndarray:
@@ -401,7 +405,8 @@ def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Any]:
         return qm.load_run(folder).policy, qm.identify(log, HORIZON).fit.model
 
 
-DESIGNS = ("mean", "Riccati", "moved", "two numbers", "improve", "improve, H", "Q-learning")
+DESIGNS = ("mean", "Riccati", "moved", "expanded", "two numbers")
+DESIGNS += ("improve", "improve, H", "Q-learning")
 #: The designs of the page; Q-learning takes hours.
 SHOWN = DESIGNS[:-1]
 #: What the designs by gradients learn, besides soft bounds.
@@ -428,6 +433,8 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
         elif design == "moved":
             moved = float((model.C @ known.x_s)[0]) - plant.price.r
             policy = designed(plant, found, moved).policy
+        elif design == "expanded":
+            policy = designed(replace(plant, price=known.price), found).policy
         elif design == "two numbers":
             models = simulated_plant(found, price, HORIZON, seed=seed)
             policy = tuned(plant, found, models, known.std, seed).policy

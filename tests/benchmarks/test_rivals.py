@@ -20,6 +20,7 @@ def test_for_constant_noise_and_a_symmetric_cost_the_regulator_is_the_quadratic_
     expected = lqr_gain(torch.tensor(found.model.A), torch.tensor(found.model.B), W)
     np.testing.assert_allclose(law.K, expected.numpy(), rtol=1e-3)
     np.testing.assert_allclose(law.x_s, 0, atol=1e-3)
+    np.testing.assert_allclose(law.price, (0, 1, 0, 0, 0, 0.1), atol=1e-3)
 
 
 def test_a_cell_says_on_how_many_seeds_improve_costs_less():
