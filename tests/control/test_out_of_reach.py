@@ -112,13 +112,6 @@ def test_inputs_with_a_weight_are_held_about_the_target_of_their_stage():
     assert np.abs(C @ x - [0.3, 0.2]).max() < 0.02
 
 
-@pytest.mark.parametrize("options", [{}, {"R": (0.5, 0.1)}, {"references": "preview"}])
-def test_c_plans_for_the_same_set_points(options):
-    difference, counts = soak(*exported(made, **options), 300, 0, 1, size=8.0, faults=0.0)
-    assert difference < 1e-8
-    assert counts["SOLVED"] == 300
-
-
 # Bounds of outputs
 
 
@@ -160,3 +153,18 @@ def test_zones_alone_rest_where_the_inputs_cost_least():
         x = model[0] @ x + model[1] @ u + [0.01, 0.0]
     row = model[1][0]  # row @ u = 0.09 holds T at 1
     assert np.abs(u - 0.09 * row / (row @ row)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        (made, {}),
+        (made, {"R": (0.5, 0.1)}),
+        (made, {"references": "preview"}),
+        (coupled, {"u_bounds": (-1.0, 1.0)}),
+    ],
+)
+def test_c_plans_for_the_same_set_points(make, options):
+    difference, counts = soak(*exported(make, **options), 300, 0, 1, size=8.0, faults=0.0)
+    assert difference < 1e-8
+    assert counts["SOLVED"] == 300

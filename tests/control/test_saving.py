@@ -74,14 +74,6 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
 
 
-def test_arguments_are_those_of_its_qp():
-    mpc = learned()
-    plain = qm.QPMPC.of(**mpc.plan.arguments)
-    plain.load_state_dict(mpc.plan.state_dict())
-    p = torch.linspace(-0.1, 0.1, mpc.plan.n_p, dtype=torch.float64)
-    assert torch.equal(plain.policy(p), mpc.plan.policy(p))
-
-
 def test_files_of_the_first_format_are_read_but_for_theta_of_another_cost(tmp_path):
     with pytest.raises(QPError, match=r"^path: got .*learned another cost, expected .* version 2"):
         qm.Controller.load(FOLDER / "saved-1.qpmpc")

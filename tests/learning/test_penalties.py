@@ -33,20 +33,6 @@ def make_mpc(generator: torch.Generator) -> QPMPC:
 # --- Deviation -----------------------------------------------------------------------------------
 
 
-def test_mask_is_the_printed_one():
-    """eq:sdp2's C_mask for z = [x_0, u_0, .., u_2, x_3]; then with blocks for entries."""
-    a, o, b = 3.0, 5.0, 7.0  # c_1 above, c_2 on, c_3 below the band
-    scalar = torch.tensor([[o, o, o, a, a, a, a], [b, b, o, o, o, a, a], [b, b, b, b, o, o, o]])
-    penalty = DeviationPenalty(drawn_mpc(1, 1, 3), c_1=a, c_2=o, c_3=b)
-    assert torch.equal(penalty.C_mask, scalar)
-
-    n_x, n_u = 4, 2
-    widths = torch.tensor([n_x, n_u] * 3 + [n_x])
-    blocks = scalar.repeat_interleave(n_x, dim=0).repeat_interleave(widths, dim=1)
-    penalty = DeviationPenalty(drawn_mpc(n_x, n_u, 3), c_1=a, c_2=o, c_3=b)
-    assert torch.equal(penalty.C_mask, blocks)
-
-
 def test_deviation_penalty_entry_by_entry(generator):
     mpc = make_mpc(generator)
     C_0 = mpc.C_0

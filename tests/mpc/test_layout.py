@@ -42,13 +42,17 @@ def test_bad_sizes_are_named(sizes):
 
 
 def test_band_distance_counts_stages():
-    expected = [
-        # x_0, u_0, x_1, u_1, x_2, u_2, x_3
-        [0, 0, 0, 1, 1, 2, 2],
-        [-1, -1, 0, 0, 0, 1, 1],
-        [-2, -2, -1, -1, 0, 0, 0],
-    ]
-    assert band_distance(Layout(1, 1, 3)).tolist() == expected
+    expected = torch.tensor(
+        [
+            # x_0, u_0, x_1, u_1, x_2, u_2, x_3
+            [0, 0, 0, 1, 1, 2, 2],
+            [-1, -1, 0, 0, 0, 1, 1],
+            [-2, -2, -1, -1, 0, 0, 0],
+        ]
+    )
+    assert torch.equal(band_distance(Layout(1, 1, 3)), expected)
+    blocks = expected.repeat_interleave(4, 0).repeat_interleave(torch.tensor([4, 2] * 3 + [4]), 1)
+    assert torch.equal(band_distance(Layout(4, 2, 3)), blocks)
 
 
 @refused(

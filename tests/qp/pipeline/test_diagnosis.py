@@ -122,8 +122,8 @@ def test_fixed_entries_beyond_a_hard_row_or_off_an_equality_are_infeasible(qp, f
 
 
 def test_a_cost_that_is_only_convex_in_the_rest_of_z_is_unbounded_where_fixed_entries_tilt_it():
-    qp = QuadraticProgram(doubles([[0.0, 1.0], [1.0, 0.0]]), doubles([0.0, 0.0]), n_known=1)
-    solution = solve_qp(qp, doubles([[1.0], [0.0]]), solver="daqp", on_failure="mask")
+    qp = QuadraticProgram(doubles([[0.0, 1.0], [1.0, 0.0]]), doubles([0.0, 1.0]), n_known=1)
+    solution = solve_qp(qp, doubles([[1.0], [-1.0]]), solver="daqp", on_failure="mask")
     assert solution.status.tolist() == [Status.UNBOUNDED, Status.SOLVED]
 
 
