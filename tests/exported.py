@@ -148,8 +148,8 @@ def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.rows) + AT_LEAST
     chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
-    origin = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0)
-    nothing = Examples([origin], np.zeros(tables.n_u), 0.0)
+    origin = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0, 0.0, 0.0)
+    nothing = Examples([origin], np.zeros(tables.n_u))
     texts, flags = sources(tables, chosen, "", nothing), (*flags, "-std=c99", "-fPIC", "-shared")
     return Library(texts, "policy", chosen.dtype, flags), tables
 

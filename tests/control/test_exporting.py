@@ -18,7 +18,7 @@ from tests.control.controllers import exported as exported_once
 from tests.control.controllers import learned, load
 from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import exporting, observer
-from torch_qpmpc.export import export
+from torch_qpmpc.export import comparison, export
 
 STEPS = int(os.environ.get("STEPS", "25"))
 A = np.array([[0.9, 0.2, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.7]])
@@ -60,6 +60,15 @@ def zoned(half: float, **options: Any) -> qm.Controller:
     names = {"outputs": ["y1", "y2"], "Q": {"y1": 1.0}, "y_bounds": {"y2": (-half, half)}}
     own = {"R": 0.02, "dR": 0.1, "u_bounds": (-0.5, 0.6), "references": "preview"}
     return qm.Controller(qm.LinearMPC((A, B, C), 8, **{**own, **names, **options}))
+
+
+def test_a_value_is_as_near_as_the_rows_whose_multipliers_exceed_it(tmp_path, monkeypatch):
+    """The target's multipliers cost 2e4 a unit of a row, at a value of 90."""
+    monkeypatch.setattr(comparison, "COMPARED", 400)  # as outside of tests
+    bounds = {"y_bounds": {"y1": (-1.0, 1.5)}, "u_bounds": ([-1.79, 0.09], [3.98, 2.93])}
+    weights = {"Q": {"y1": 0.0}, "R": 0.01, "dR": [0.16565209357659758, 0.10641509996676105]}
+    model = [[0.767452706335574]], [[-1.1213164999269107, 2.150466863517873]]
+    qm.Controller(qm.LinearMPC(model, 5, **weights, **bounds)).export_c(tmp_path)
 
 
 @pytest.mark.parametrize("half", [0.2, 20.0])

@@ -196,15 +196,19 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
         got = f"no solution of its QP at {len(p)} states"
         remedy = "See mpc.solve(s): hard rows may contradict each other; finite slacks soften them."
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
-    H = mpc.quadratic_program().H.detach().double().cpu().numpy()[: mpc.n_p, : mpc.n_p]
-    terms = ((np.abs(p) @ np.abs(H)) * np.abs(p)).sum(-1) / 2
+    qp, n_p = mpc.quadratic_program(), mpc.n_p
+    H, G = (x.detach().double().abs().cpu().numpy() for x in (qp.H, qp.G))
+    terms = ((np.abs(p) @ H[:n_p, :n_p]) * np.abs(p)).sum(-1) / 2
     u, value = actions(mpc, exact), np.where(solved, exact.value, 0.0)
+    forces = (np.abs(exact.lam) * (np.abs(exact.z) @ G.T)).sum(-1)  # what an error of a row costs
+    size = np.fmax(np.fmax(np.abs(value), _size(value, solved)), np.where(solved, forces, 0.0))
+    values = np.stack((value, size, terms), -1).tolist()
     examples = [
-        Example(kind, p[i], 0 if solved[i] else INFEASIBLE, u[i], float(value[i]), float(terms[i]))
+        Example(kind, p[i], 0 if solved[i] else INFEASIBLE, u[i], *values[i])
         for kind, indices in chosen.items()
         for i in indices
     ]
-    return Examples(examples, _size(u, solved), float(_size(value, solved))), exact
+    return Examples(examples, _size(u, solved)), exact
 
 
 def _size(x: Array, solved: Array) -> Array:

@@ -53,9 +53,7 @@ def required_compiler() -> list[str]:
     if (command := compiler()) is None:
         got, remedy = "none on the PATH", "Install one, or pip install ziglang, which has clang."
         if named := _named():
-            remedy += (
-                f" $CC is {' '.join(named)!r}, of which {named[0]!r} does not exist: unset it."
-            )
+            remedy += f" $CC is {' '.join(named)!r}; {named[0]!r} does not exist: unset it."
         raise QPError.expected("compiler", got, "a C compiler: $CC, cc, gcc or clang", remedy)
     return command
 

@@ -212,13 +212,11 @@ def _factor(H_v: Array) -> tuple[Array, float]:
     eigenvalues = np.linalg.eigvalsh(H_v)
     lowest, highest = eigenvalues[0], eigenvalues[-1]
     if not lowest > SINGULAR * highest:
-        raise QPError.expected(
-            "H",
-            f"eigenvalues from {lowest:.3g} to {highest:.3g} on the plan",
-            "a cost that is positive definite on all plans that satisfy C z = b",
-            "Give the actions a small weight, such as 1e-5, by stage_weight or LinearMPC's R, "
-            "and learn H with it: without one u_0 is not unique, and the C could not be exact.",
-        )
+        got = f"eigenvalues from {lowest:.3g} to {highest:.3g} on the plan"
+        want = "a cost that is positive definite on all plans that satisfy C z = b"
+        remedy = "Give the actions a small weight, such as 1e-5, by stage_weight or LinearMPC's R, "
+        remedy += "and learn H with it: without one, u_0 is not unique, nor the C exact."
+        raise QPError.expected("H", got, want, remedy)
     return np.linalg.cholesky(H_v), float(highest / lowest)
 
 

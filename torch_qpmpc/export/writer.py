@@ -49,22 +49,22 @@ WIDTH = 100
 
 
 class Example(NamedTuple):
-    """A state of the self-test: p, and the expected code, u and value, of terms of a size."""
+    """A state of the self-test: p, and the expected code, u and value, of a size and of terms."""
 
     kind: str
     p: Array
     code: int
     u: Array
     value: float
-    terms: float = 0.0
+    size: float
+    terms: float
 
 
 class Examples(NamedTuple):
-    """The states of the self-test, and the sizes of actions ``(n_u,)`` and of values there."""
+    """The states of the self-test, and the sizes of actions there, ``(n_u,)``."""
 
     states: Sequence[Example]
     u: Array
-    value: float
 
 
 class Settings(NamedTuple):
@@ -251,7 +251,7 @@ def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
         "EXAMPLE_U": np.array([e.u for e in states]).reshape(-1, tables.n_u),
         "EXAMPLE_VALUE": np.array([e.value for e in states]),
         "NEAR_U": near.u * examples.u,
-        "NEAR_VALUE": near.value * np.fmax([abs(e.value) for e in states], examples.value)
+        "NEAR_VALUE": near.value * np.array([e.size for e in states])
         + ROUNDING * np.finfo(dtype).eps * np.array([e.terms for e in states]),
     }
     return "\n".join(
