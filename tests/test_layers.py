@@ -32,7 +32,7 @@ BUDGET = {
     "control": 4824,  # nonlinear plants
     "envs": 1427,
     "experiment": 2886,
-    "export": 1482,
+    "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2641,
     "mpc": 3851,

@@ -195,13 +195,15 @@ def test_infeasible_states_are_moved_to_the_edge_of_the_feasible_ones_at_once():
     assert (further.status == Status.INFEASIBLE).all()
 
 
-def test_a_loose_solution_is_replaced_before_it_is_refined():
+@pytest.mark.parametrize(("large", "error"), [(comparison.LARGE, 1e-7), (4, 0.0)])
+def test_a_loose_solution_is_replaced_or_found_from_its_active_set(monkeypatch, large, error):
+    monkeypatch.setattr(comparison, "LARGE", large)
     mpc = shifted()
     p = draw(make_tables(mpc), 12)
     best = comparison.reference(mpc, p)
     solved = np.flatnonzero(best.status == Status.SOLVED)
     assert len(solved) > 5
-    loose = best._replace(z=0 * best.z, lam=0 * best.lam, value_error=best.value_error + 1e-7)
+    loose = best._replace(z=0 * best.z, lam=0 * best.lam, value_error=best.value_error + error)
     got = comparison.sharpen(mpc, p, loose, solved)
     expected = comparison.actions(mpc, best)[solved]
     np.testing.assert_allclose(comparison.actions(mpc, got)[solved], expected, atol=1e-7)

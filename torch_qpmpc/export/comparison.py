@@ -25,7 +25,7 @@ from torch_qpmpc.qp.program import Status
 #: Number of random states that the compiled policy is compared at; at least `LEAST` for a `LARGE`
 #: QP, whose cold solves take long.
 COMPARED, LEAST = 400, 40
-#: QPs of more rows are solved by the interior point alone.
+#: QPs of more rows are solved by the interior point, and from its active sets where in doubt.
 LARGE = 200
 #: Differences above this, relative to the largest action or value, are worth an exact solution.
 DOUBTFUL = 1e-9
@@ -92,12 +92,14 @@ def _is_large(qps: Programs) -> bool:
 def sharpen(mpc: QPMPC, p: Array, coarse: BatchSolution, which: Array) -> BatchSolution:
     """Refine the solutions of ``coarse`` at the indices ``which``, or others if they are loose."""
     qps, exact = programs(mpc, p), coarse.at(np.arange(len(p)))
-    if mpc.levels is not None:  # each plan has a QP of its own
+    if mpc.levels is not None or not len(which):  # with levels, each plan has a QP of its own
+        return exact
+    if _is_large(qps):  # a refinement takes long, and an interior point stops short of bounds
+        exact.put(which, solve_programs(qps.take(which), "daqp", exact.active[which]))
         return exact
     if len(loose := which[exact.value_error[which] > DOUBTFUL]):
         exact.put(loose, reference(mpc, p[loose], "torch"))
-    if len(which) and not _is_large(qps):
-        refine(qps, exact, which, last=True)
+    refine(qps, exact, which, last=True)
     return exact
 
 

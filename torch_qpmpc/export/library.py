@@ -86,12 +86,8 @@ class Library:
     def __init__(
         self, files: Mapping[str, str], name: str, dtype: str, flags: Sequence[str] = ()
     ) -> None:
-        self._made_of = files, name, dtype, tuple(flags or FLAGS)
-        self._load()
-
-    def _load(self) -> None:
-        files, name, dtype, flags = self._made_of
-        self.real = np.dtype(dtype)
+        flags = tuple(flags or FLAGS)
+        self._made_of, self.real = (files, name, dtype, flags), np.dtype(dtype)
         library = compiled({**files, "wrapper_.c": filled("wrapper.c", name)}, flags)
         self._steps = library[f"{name}_steps"]
         self._resets = library[f"{name}_resets"]
@@ -102,20 +98,14 @@ class Library:
         pointer, long = ctypes.c_void_p, ctypes.c_long
         self._steps.argtypes = [pointer] * 5 + [long]
         self._resets.argtypes = [pointer, long]
-        self._info = np.dtype(
-            [(n, self.real) for n in ("value", "gap", "violation")] + [("iterations", np.int32)],
-            align=True,
-        )
+        reals = [(n, self.real) for n in ("value", "gap", "violation")]
+        self._info = np.dtype([*reals, ("iterations", np.int32)], align=True)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Library:
         return self
 
-    def __getstate__(self) -> tuple[Any, ...]:
-        return self._made_of
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self._made_of = state
-        self._load()
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Library, self._made_of
 
     def states(self, count: int) -> np.ndarray:
         """Return the reset states of ``count`` controllers, as bytes."""
