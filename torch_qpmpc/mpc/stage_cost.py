@@ -200,7 +200,7 @@ def _best_convex(seen: _Observed, block: Tensor) -> Tensor:
     # Not at a root of zero, where the gradient is zero.
     start = eigenvalues.clamp(min=FLOOR * eigenvalues.abs().amax()).sqrt()
     root = (vectors * start).contiguous().requires_grad_()
-    ends = {"max_iter": ITERATIONS, "tolerance_grad": TOLERANCE, "tolerance_change": 0.0}
+    ends: Any = {"max_iter": ITERATIONS, "tolerance_grad": TOLERANCE, "tolerance_change": 0.0}
     optimizer = torch.optim.LBFGS([root], **ends, history_size=50, line_search_fn="strong_wolfe")
 
     def closure() -> Tensor:
