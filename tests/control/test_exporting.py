@@ -270,6 +270,9 @@ def test_a_controller_that_disagrees_is_refused(off, code, failed, match, tmp_pa
 
 def test_a_loop_without_a_first_plan_is_refused(tmp_path):
     band = {"y_bounds": (10.0, 20.0), "y_slack": np.inf, "u_bounds": (-1.0, 1.0)}
-    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, R=0.1, **band)
-    with pytest.raises(SolverError, match=r"^No input satisfies the hard bounds at rest: widen"):
-        qm.Controller(mpc).export_c(tmp_path)
+    four = {"u_levels": {"u1": [-1.0, 1.0]}, "min_on": 4, "y_bounds": (-4.0, 4.0)}
+    text = "^No input keeps the hard bounds from rest: widen them, "
+    for B, own, remedy in ((0.5, band, "or give"), (2.0, band | four, "add levels, shorten")):
+        mpc = qm.LinearMPC(([[0.9]], [[B]]), 8, Q=1.0, R=0.1, **own)
+        with pytest.raises(SolverError, match=text + remedy):
+            qm.Controller(mpc).export_c(tmp_path)

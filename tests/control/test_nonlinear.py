@@ -22,6 +22,7 @@ OPTIONS: Any = {"Q": {"level": 1.0, "T": 0.01}, "dR": 0.1, "du_bounds": (-0.2, 0
 OPTIONS |= {"u_bounds": (0.0, 2.0), "disturbances": {"level": "cold", "T": "hot"}}
 REST = [1.0, 40.0], [30 / 70, 40 / 70]
 NOISE = np.array([0.003, 0.1])
+LOCAL = ", as far as the linearisation holds"
 
 
 def mixed(x: Tensor, u: Tensor, *d: Tensor) -> Tensor:
@@ -105,7 +106,8 @@ def test_a_linear_function_is_the_linear_plant(references, monkeypatch):
     for name in ("x", "w", "p"):
         assert_allclose(getattr(pair[1], name), getattr(pair[0], name), atol=1e-6)
     for texts in zip(*((str(own.review()), str(own.explain())) for own in pair), strict=True):
-        assert texts[0] == texts[1]
+        assert texts[0] == texts[1].replace(LOCAL, "")
+        assert LOCAL in texts[1]
 
 
 def test_known_flows_are_fed_forward():
@@ -131,7 +133,7 @@ def test_a_review_is_of_the_operating_point_that_a_user_names():
         mpc = qm.LinearMPC(replace(at, dynamics=None), 10, **OPTIONS | options)
         twin = qm.Controller(mpc, noise=NOISE).review([level, T])
         for name in ("terminal weight", "disturbances", "set-points", "stability", "margin"):
-            assert review[name].text == twin[name].text
+            assert review[name].text.replace(LOCAL, "") == twin[name].text
         assert not review.faults
     assert own.review({"level": 20.0, "T": 40.0}).faults[0].name == "set-points"
 

@@ -22,6 +22,7 @@ from torch_qpmpc.learning.operators import QPActorValueOperator, warm_policy
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.mpc.nonlinear import PlanSolution, of_networks
 from torch_qpmpc.proofs import Polytope, largest_difference
+from torch_qpmpc.qp.program import Status
 
 N = 5
 LEARN = ("H", "H_f", "q", "c", "lb", "ub", "w")
@@ -316,6 +317,19 @@ def test_a_state_from_which_every_plan_leaves_the_region_of_the_dynamics_has_no_
     assert solution.converged.tolist() == [True, False]
     with pytest.raises(QPError, match="no certified solution"):
         made(dynamics=limited, learn=()).predict([0.95, 3.0])
+
+
+@pytest.mark.parametrize("dynamics", [bent, lambda x, u: (bent(x, u), (x**4).sum(-1))])
+def test_a_state_of_nan_has_no_plan_and_no_part_in_gradients(dynamics):
+    options = {"stage_weight": [1.0, 0.1], "on_failure": "mask", "solver": "daqp"}
+    mpc, s = QPMPC.of(1, 1, 5, dynamics=dynamics, **options), torch.tensor([[1.0], [torch.nan]])
+    solution, alone = mpc.solve(s.double()), mpc.solve(s[:1].double())
+    assert solution.status.tolist() == [Status.SOLVED, Status.INVALID_DATA]
+    inputs = [x for x in mpc.parameters() if x.requires_grad]
+    found, want = (torch.autograd.grad(x.value[0], inputs) for x in (solution, alone))
+    assert_close(found, want)
+    with pytest.raises(QPError, match="1 INVALID_DATA"):
+        QPMPC.of(1, 1, 5, dynamics=dynamics, **{**options, "on_failure": "raise"})(s.double())
 
 
 def test_actions_satisfy_hard_rows_of_several_actions():

@@ -232,15 +232,15 @@ def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:
         SolverError: no input satisfies the hard bounds in the first step.
     """
     rows, stages = [], slice(None if law.design.references == "preview" else 1)
+    loop = closed_loop(law, Memory(course["u"]), None, steps, act=act, **course)
     try:
-        for (y, r, known), move, _ in closed_loop(
-            law, Memory(course["u"]), None, steps, act=act, **course
-        ):
+        for (y, r, known), move, _ in loop:
             rows.append((y, r[stages], known, move.u))
     except (QPError, SolverError) as error:  # no plan, or outputs above `Law.max_plausible`
         if not rows:
-            remedy = "widen them, or give the outputs a y_slack"
-            raise SolverError(f"No input satisfies the hard bounds at rest: {remedy}.") from error
+            levels = "add levels, shorten min_on or min_off, " * bool(law.design.levels)
+            remedy = f"widen them, {levels}or give the outputs a y_slack"
+            raise SolverError(f"No input keeps the hard bounds from rest: {remedy}.") from error
     y, r, known, u = map(np.array, zip(*rows, strict=True))
     return Loop(y, r, known, u, course["u"][None])
 

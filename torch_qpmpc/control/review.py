@@ -267,16 +267,16 @@ def set_points(mpc: LinearMPC, w: Array, known: Array, r_last: Array, assumed: b
     design, faults = mpc.design, []
     plant, (low, high) = design.plant, design.bounds_at(known, True)[0]
     lower, upper = (reach := _reach(design, w, known)).T
-    acting = np.flatnonzero(plant.E.any(0))
-    held = " and ".join(plant.quantity(plant.known[i], known[i]) for i in acting)
-    at = f"At {held}{' (assumed)' * assumed} the" if held else "The"
+    held = [plant.quantity(plant.known[i], known[i]) for i in np.flatnonzero(plant.E.any(0))]
+    at = f"At {' and '.join(held)}{' (assumed)' * assumed} the" if held else "The"
     if np.isnan(lower).any():
         text = f"{at} plant rests with no input within its bounds."
         return Finding("set-points", False, text, "Widen u_bounds.")
     numbers = {f"{name} reaches": ends for name, ends in zip(plant.outputs, reach, strict=True)}
     ends = zip(plant.outputs, *reach.T, strict=True)
     spans = (f"{plant.quantity(name, a)} to {b:.4g}" for name, a, b in ends)
-    text = f"{at} outputs reach {', '.join(spans)}."
+    local = ", as far as the linearisation holds" * (plant.dynamics is not None)
+    text = f"{at} outputs reach {', '.join(spans)}{local}."
     for i, name in enumerate(plant.outputs):
         if lower[i] > high[i] or upper[i] < low[i]:
             faults.append(f"Let y_bounds of {name} overlap {lower[i]:.4g} .. {upper[i]:.4g}.")

@@ -196,7 +196,7 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
     exact = sharpen(mpc, p, coarse, np.concatenate([chosen[kind] for kind in [*kinds][:3]]))
     if not solved.any():
         got = f"no solution of its QP at {len(p)} states"
-        remedy = "See mpc.solve(s): hard rows may contradict each other; finite slacks soften them."
+        remedy = "See mpc.solve(s): hard rows may contradict levels or each other; a slack softens."
         raise QPError.expected("mpc", got, "a QP that a solver solves", remedy)
     qp, n_p = mpc.quadratic_program(), mpc.n_p
     H, G = (x.detach().double().abs().cpu().numpy() for x in (qp.H, qp.G))

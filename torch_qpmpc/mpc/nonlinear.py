@@ -240,7 +240,8 @@ class SequentialQP(nn.Module):
         elif of_l.any():
             if W is None:
                 W = self.curvature(w, F.pad(torch.ones_like(powers), (n_x, 0)).expand_as(out))
-            values, vectors = torch.linalg.eigh(powers.unsqueeze(-1) * W)
+            W = (powers.unsqueeze(-1) * W).nan_to_num(0.0, 0.0, 0.0)  # the slope tells of these
+            values, vectors = torch.linalg.eigh(W)
             H = (vectors * values.clamp(min=0).unsqueeze(-2)) @ vectors.mT
             q, c = q - times(H, w), c + (w * times(H, w)).sum(-1) / 2
         if H is not None:
