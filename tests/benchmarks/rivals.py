@@ -463,7 +463,7 @@ def shown(rows: Any) -> str:
             cells[plant, size, design] = f"{J.median():.3g}/{J.max():.3g}{mark}"
         plants.append((plant, size))
         for name, design in KEPT.items():
-            if design in own["design"].to_numpy():
+            if {design, "mean"} <= {*own["design"]}:
                 cells[plant, size, name] = accepts(own, size, design)
     names = [x for x in (*rows["design"].unique(), *KEPT) if any(x in key for key in cells)]
     lines = [[x, *(cells.get((*key, x), "") for key in plants)] for x in names]
@@ -484,6 +484,8 @@ def compared(rows: Any) -> dict[Any, str]:
     """Return on how many seeds `improve` costs less, with * where p < 0.05 by Holm's procedure."""
     J = rows.pivot_table("J", ["plant", "transitions", "seed"], "design")
     better, p = {}, {}
+    if "improve" not in J:
+        return {}
     for (plant, size), own in J.groupby(["plant", "transitions"]):
         for design in own.columns.drop("improve"):
             if own[design].notna().all():

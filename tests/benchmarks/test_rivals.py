@@ -38,3 +38,6 @@ def test_a_cell_says_on_how_many_seeds_improve_costs_less():
     text = shown(pd.DataFrame(rows))
     assert "| mean | 2.09/2.18/10* |" in text
     assert "| kept, dearer, most | 7/0/-50.0% |" in text
+    left = {one: [x for x in rows if x["design"] != one] for one in ("improve", "mean")}
+    assert "| mean | 2.09/2.18 |" in shown(pd.DataFrame(left["improve"]))
+    assert "kept" not in shown(pd.DataFrame(left["mean"]))

@@ -206,6 +206,27 @@ def test_a_reward_in_an_array_is_one_number_or_ends_the_episode(register, count)
     assert len(plant.raised) == 2 * (count - 1)
 
 
+@pytest.mark.filterwarnings("ignore:.*The obs returned by")
+@pytest.mark.parametrize("step", [0, 2])
+def test_an_observation_of_another_shape_than_its_space_is_an_error(register, step):
+    class Wide(Counter):
+        def reset(self, *, seed=None, options=None):
+            y, info = super().reset(seed=seed)
+            return (y if step else y.repeat(3)), info
+
+        def step(self, action):
+            y, *rest = super().step(action)
+            return (y.repeat(3) if self.k == step else y), *rest
+
+    plant = GymnasiumPlant(register(Wide))
+    match = r"task.id: got an observation of shape \(3,\), expected \(1,\), as in its space"
+    with pytest.raises(QPError, match=match):
+        gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=3, starts=2)
+    with pytest.raises(QPError, match=match):
+        plant.vectorised(2, 3, seed=0).rollout(3)
+    assert not plant.raised
+
+
 def test_a_terminated_episode_is_terminated(register):
     env = GymnasiumPlant(register(Counter, last=2)).vectorised(1, 3, seed=0)
     batch = env.rollout(4, break_when_any_done=False)

@@ -380,14 +380,25 @@ class Broken(Lag):
         raise RuntimeError("no licence")
 
 
+class Unpriced(Lag):
+    """Has no reward."""
+
+    def step(self, action):
+        y, _, *rest = super().step(action)
+        return y, np.nan, *rest
+
+
+LICENCE = "step, .* ends them by RuntimeError: no licence"
+
+
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("price", [1, -1])
-def test_a_log_without_a_finite_step_is_an_error_with_its_cause(register, price):
-    register(Broken, name="Lag-v0")
-    cause = (
-        r"start: got 400 episodes without a finite step, .* ends them by RuntimeError: no licence"
-    )
-    with pytest.raises(QPError, match=cause):
+@pytest.mark.parametrize(
+    ("plant", "price", "cause"),
+    [(Broken, 1, LICENCE), (Broken, -1, LICENCE), (Unpriced, 1, "reward")],
+)
+def test_a_log_without_a_finite_step_is_an_error_with_its_cause(register, plant, price, cause):
+    register(plant, name="Lag-v0")
+    with pytest.raises(QPError, match=rf"start: got \d+ episodes without a finite {cause}"):
         chosen(*DATA, f"task.kwargs={{price: {price}}}")
 
 

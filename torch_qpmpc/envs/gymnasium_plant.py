@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Tuple
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import FlattenObservation, TransformAction
+from gymnasium.wrappers import FlattenObservation
 from torch import Tensor
 from torchrl.envs import DoubleToFloat, EnvBase, GymWrapper, TransformedEnv
 
@@ -94,11 +94,9 @@ class GymnasiumPlant:
         some plants react to the tiniest one.
         """
         env = gymnasium.make(self.id, max_episode_steps=max_steps, **self.kwargs)
-        applied = partial(_applied, env.action_space)
-        env = TransformAction(_Guarded(env, self.raised), applied, None)
         if isinstance(env.observation_space, Dict | Tuple):
             env = FlattenObservation(env)
-        return env
+        return _Guarded(env, self.raised)
 
     def _bounds(self, name: str, space: Any) -> tuple[Tensor, Tensor]:
         if not isinstance(space, Box) or len(space.shape) != 1:
@@ -132,35 +130,37 @@ class GymnasiumPlant:
 
 
 class _Guarded(gymnasium.Wrapper):
-    """Ends the episode at an exception of the environment's step, and notes it in ``raised``."""
+    """Bounds actions, checks observations, and notes in ``raised`` what ends an episode's step."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], raised: list[str]) -> None:
         super().__init__(env)
         self._raised, self._last = raised, None
 
+    def _seen(self, y: Any) -> Any:
+        if np.shape(y) != (shape := self.observation_space.shape):
+            got, want = f"an observation of shape {np.shape(y)}", f"{shape}, as in its space"
+            raise QPError.expected("task.id", got, want)
+        self._last = y
+        return y
+
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        self._last, info = self.env.reset(**options)
-        return self._last, info
+        y, info = self.env.reset(**options)
+        return self._seen(y), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        low, high = self.action_space.low, self.action_space.high
+        size = np.nan_to_num(np.abs((low, high)), posinf=0.0).max(0)
+        applied = np.where(np.abs(action) <= ROUNDING * size, 0, action).clip(low, high)
         try:
-            self._last, reward, terminated, truncated, info = self.env.step(action)
+            y, reward, terminated, truncated, info = self.env.step(applied.astype(action.dtype))
             reward = np.asarray(reward, float).item()  # from an array of one, too
         except gymnasium.error.Error:  # of how the environment is used
             raise
         except Exception as error:
-            line = traceback.extract_tb(error.__traceback__)[-1]
-            place = f"{line.filename}, line {line.lineno}"
-            self._raised.append(f"{type(error).__name__}: {error} ({place})")
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            text = f"{type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
+            self._raised.append(text)
             if len(self._raised) == 1:
-                warnings.warn(f"The plant ends an episode by {self._raised[0]}.", stacklevel=2)
+                warnings.warn(f"The plant ends an episode by {text}.", stacklevel=2)
             return self._last, math.nan, False, True, {}
-        return self._last, reward, terminated, truncated, info
-
-
-def _applied(space: Any, action: np.ndarray) -> np.ndarray:
-    """Return the action within its bounds, and zero for entries that are a solver's rounding."""
-    ends = np.abs((space.low, space.high))
-    size = np.where(np.isfinite(ends), ends, 0.0).max(0)
-    applied = np.where(np.abs(action) <= ROUNDING * size, 0, action)
-    return applied.clip(space.low, space.high).astype(action.dtype)
+        return self._seen(y), reward, terminated, truncated, info

@@ -29,12 +29,7 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.projections import nearest_psd
-from torch_qpmpc.mpc.riccati import (
-    affine_cost_to_go,
-    lqr_gain,
-    stage_weight,
-    terminal_riccati,
-)
+from torch_qpmpc.mpc.riccati import affine_cost_to_go, lqr_gain, stage_weight, terminal_riccati
 from torch_qpmpc.mpc.scheme import Scheme
 from torch_qpmpc.mpc.stage_cost import StageCost, fit_rewards, scheme_cost
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
@@ -89,9 +84,8 @@ class Start(NamedTuple):
 
     def plant(self, physics: AnyPlant) -> AnyPlant:
         """Return ``physics``, whose observation is the estimate of this start's observer."""
-        if not self.observed or isinstance(physics, LinearSystem):
-            return physics
-        return physics.observed(self.model)
+        fixed = isinstance(physics, LinearSystem)
+        return physics if fixed else physics.observed(self.observer)
 
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
@@ -121,7 +115,9 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     log, cut = without_blow_ups(log) if isinstance(log, TensorDictBase) else (log, 0)
     if cut and not valid_steps(log).any():
         remedy = "".join(f"The plant ends them by {x}." for x in getattr(physics, "raised", [])[:1])
-        raise QPError.expected("start", f"{cut} episodes without a finite step", "a log", remedy)
+        reward = log.get(("next", "reward"), log["action"])
+        what = "step" if remedy or reward.isfinite().any() else "reward"
+        raise QPError.expected("start", f"{cut} episodes without a finite {what}", "a log", remedy)
     observed = not isinstance(physics, LinearSystem)
     if observed:
         sizes = (physics.n_y, physics.n_d) if isinstance(physics, Plant) else (physics.n_x, 0)
