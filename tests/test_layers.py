@@ -35,9 +35,9 @@ BUDGET = {
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2641,
-    "mpc": 3851,
+    "mpc": 3849,
     "proofs": 1001,
-    "qp": 5299,  # caches that notice a called kernel, which the levels pay for
+    "qp": 5301,  # caches that notice a called kernel, which the levels pay for
     "study": 586,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

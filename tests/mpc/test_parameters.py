@@ -1,6 +1,7 @@
 """`QPMPC.predict` of one state: the answers of a batch, after every kind of change of theta."""
 
 import copy
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -149,10 +150,11 @@ def test_a_functional_call_uses_its_own_theta():
     assert np.abs(own - expected).max() > 1e-3
 
 
-def test_a_copy_has_a_theta_of_its_own():
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_has_a_theta_of_its_own(copied):
     mpc = random_mpc(3)
     own = mpc.predict(STATES[0])
-    twin = copy.deepcopy(mpc)
+    twin = copied(mpc)
     moved(twin)
     assert_predicted(twin)
     assert np.abs(mpc.predict(STATES[0]) - own).max() <= 1e-9

@@ -469,7 +469,7 @@ def _strict(qp: QuadraticProgram, fixed: Tensor, known: Sequence[Tensor]) -> Ten
     size = torch.where(size > 0, size, 1.0).unsqueeze(1)
     H, G = H[:, n_f:] / size / size.mT, G / size
     force = G.norm(dim=-1)
-    held = active_rows(lam * force, *theta[6:8], theta[8] * force)[0]
+    held = active_rows(lam * force, theta[6], theta[7], theta[8] * force)[0]
     rows = torch.where(held.unsqueeze(-1), F.normalize(G, dim=-1), 0)
     kept = torch.linalg.pinv(rows) @ rows
     free = torch.eye(H.shape[-1]).to(H) - kept

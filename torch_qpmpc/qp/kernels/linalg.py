@@ -28,10 +28,10 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
     except RuntimeError:
         return numba.njit(error_model="numpy", **options)(function)
     with suppress(AttributeError):  # these are private to Numba
-        own = kernel._cache._cache_file
-        called = (x for x in function.__globals__.values() if isinstance(x, Dispatcher))
-        stamps = (x._cache._cache_file._source_stamp for x in called)
-        own._source_stamp = {own._source_stamp}.union(*stamps)
+        kernels: list[Any] = [kernel]
+        kernels += [x for x in function.__globals__.values() if isinstance(x, Dispatcher)]
+        own, *called = (x._cache._cache_file for x in kernels)
+        own._source_stamp = {own._source_stamp}.union(*(x._source_stamp for x in called))
     return kernel
 
 

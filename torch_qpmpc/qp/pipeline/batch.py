@@ -77,6 +77,9 @@ class Prepared:
         self.elimination: Elimination | None = None
         self.known: dict[tuple, Any] = {}
 
+    def __getstate__(self) -> dict[str, Any]:  # without what `held` made, which has no copy
+        return vars(self) | {"known": {k: x for k, x in self.known.items() if k[0] != "held"}}
+
     @cached_property
     def shared(self) -> bool:
         """True if the QPs differ only in their fixed entries."""
@@ -218,8 +221,7 @@ class Programs:
         if not shared:
             batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
             batch = broadcast(batch, *batches)
-        fixed = _flattened(fixed, batch, (n_f,)).numpy(force=True)
-        fixed = np.ascontiguousarray(fixed, np.float64)
+        fixed = np.ascontiguousarray(_flattened(fixed, batch, (n_f,)).numpy(force=True), float)
         flat = [x.numpy(force=True)[np.newaxis] for x in theta]
         group = np.zeros(len(fixed), np.int64)
         if not shared:
