@@ -314,6 +314,7 @@ def regulator(plant: Priced, found: Identified) -> Regulator:
         return float(costs.numpy() @ mass / mass.sum())
 
     std, r = float(S[0, 0]) ** 0.5, plant.price.r
+    m = h = w = math.nan
     for _ in range(30):
         around = (r - 6 * std, r + 6 * std)
         m = scipy.optimize.minimize_scalar(

@@ -217,7 +217,9 @@ def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):
 
     def found(x_unit: float, u_unit: float, cost: float) -> tuple[Tensor, ...]:
         plant, sizes = Pendulum(), {"state_bounds": x_unit, "action_bounds": u_unit}
-        own = {k: [[x * sizes[k] for x in side] for side in v] for k, v in bounds.items()}
+        own: dict[str, Any] = {
+            k: [[x * sizes[k] for x in side] for side in v] for k, v in bounds.items()
+        }
         weight = [cost / x_unit**2, 0.1 * cost / x_unit**2, 0.1 * cost / u_unit**2]
         own |= {"stage_weight": weight, "state_slack": torch.inf if hard else 5 * cost / x_unit}
 
@@ -313,6 +315,7 @@ def test_a_state_from_which_every_plan_leaves_the_region_of_the_dynamics_has_no_
 
     mpc = made(dynamics=limited, on_failure="mask", learn=())
     solution = mpc.solve(torch.tensor([[0.5, 0.0], [0.95, 3.0]], dtype=torch.float64))
+    assert isinstance(solution, PlanSolution)
     assert solution.solved.tolist() == [True, False]
     assert solution.converged.tolist() == [True, False]
     with pytest.raises(QPError, match="no certified solution"):
