@@ -1,5 +1,7 @@
 """Saved MPCs and controllers: the same inputs to the last digit, and messages."""
 
+import copy
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,10 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     controller.save(tmp_path / "mine.qpmpc")
     twin = qm.Controller.load(tmp_path / "mine.qpmpc")
     assert twin.mpc.plan.learned == controller.mpc.plan.learned
-    assert np.array_equal(inputs(twin), inputs(controller))
+    copies = copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))
+    us = inputs(controller)
+    for own in (twin, *copies):
+        assert np.array_equal(inputs(own), us)
     assert twin.known is not None
     assert twin.known.tolist() == [0.3, 0.19]
     assert twin.simulate(steps=1).u_last.tolist() == [0.1]

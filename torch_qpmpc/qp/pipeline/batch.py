@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torch_qpmpc.qp.kernels import active_set, sample
 from torch_qpmpc.qp.kernels.linalg import Held, held
+from torch_qpmpc.qp.pipeline import condensing
 from torch_qpmpc.qp.pipeline.arrays import (
     BackendSolution,
     BatchSolution,
@@ -29,18 +30,7 @@ from torch_qpmpc.qp.pipeline.arrays import (
     per_qp,
     to_numpy,
 )
-from torch_qpmpc.qp.pipeline.condensing import (
-    Condensed,
-    Dual,
-    Elimination,
-    Reduced,
-    Sizes,
-    condense,
-    convex,
-    dual,
-    reduce,
-    sizes,
-)
+from torch_qpmpc.qp.pipeline.condensing import Condensed, Dual, Elimination, Reduced, Sizes
 from torch_qpmpc.qp.pipeline.scaling import Units
 from torch_qpmpc.qp.program import NDIMS, UNKNOWN, broadcast
 
@@ -118,30 +108,30 @@ class Prepared:
 
     @kept
     def _condensed(self, n_kept: int) -> Condensed:
-        return condense(self.theta, n_kept, self.elimination)
+        return condensing.condense(self.theta, n_kept, self.elimination)
 
     @kept
     def reduced(self, n_f: int) -> Reduced:
         """Return the QPs in their free variables."""
-        return reduce(self.condensed(n_f), self.theta, self.group, n_f)
+        return condensing.reduce(self.condensed(n_f), self.theta, self.group, n_f)
 
     @kept
     def convex(self, n_f: int) -> np.ndarray | None:
         """Return the mask of positive semidefinite reduced H, ``(M,)``; None if all are."""
         # Cholesky factors prove it; eigenvalues take many times as long.
         surely = np.isfinite(self.sizes(n_f).inverse).all()
-        return None if surely or (mask := convex(self.reduced(n_f).H)).all() else mask
+        return None if surely or (mask := condensing.convex(self.reduced(n_f).H)).all() else mask
 
     @kept
     def sizes(self, n_f: int) -> Sizes:
         """Return the `Sizes` of the reduced QPs."""
-        return sizes(self.condensed(n_f), self.theta, n_f)
+        return condensing.sizes(self.condensed(n_f), self.theta, n_f)
 
     @kept
     def dual(self, n_f: int, least: float | None = None) -> Dual:
         """Return the `Dual` of the reduced QPs, see `condensing.dual`."""
         _, _, H, G, *_ = self.reduced(n_f)
-        return dual(H, G, least)
+        return condensing.dual(H, G, least)
 
     @kept
     def held(self, n_f: int) -> Held:
