@@ -37,7 +37,7 @@ BUDGET = {
     "identification": 2641,
     "mpc": 3849,
     "proofs": 1001,
-    "qp": 5301,  # caches that notice a called kernel, which the levels pay for
+    "qp": 5291,  # caches that notice a called kernel, which the levels pay for
     "study": 586,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

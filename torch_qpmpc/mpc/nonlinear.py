@@ -161,8 +161,8 @@ class SequentialQP(nn.Module):
                 after, cost = self.stage(*w.split(self.sizes, -1))
             got, sloped = [tuple(after.shape), *shapes[1:]], after.requires_grad
             got = got if cost is None else [got[0], tuple(cost.shape)]
-        except (AttributeError, RuntimeError, TypeError) as error:
-            want, remedy = "a function of tensors (*batch, n) in float64", "Make networks double()."
+        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            want, remedy = "x+ or (x+, l) of float64 (*batch, n)", "Check n_x, n_u; use double()."
             raise QPError.expected("dynamics", repr(error), want, remedy) from error
         if got != shapes or not sloped:
             what = f"x+ and l of shapes {got}" if sloped else "x+ without a gradient"
@@ -240,8 +240,7 @@ class SequentialQP(nn.Module):
         elif of_l.any():
             if W is None:
                 W = self.curvature(w, F.pad(torch.ones_like(powers), (n_x, 0)).expand_as(out))
-            W = (powers.unsqueeze(-1) * W).nan_to_num(0.0, 0.0, 0.0)  # the slope tells of these
-            values, vectors = torch.linalg.eigh(W)
+            values, vectors = torch.linalg.eigh((powers.unsqueeze(-1) * W).nan_to_num(0, 0, 0))
             H = (vectors * values.clamp(min=0).unsqueeze(-2)) @ vectors.mT
             q, c = q - times(H, w), c + (w * times(H, w)).sum(-1) / 2
         if H is not None:
