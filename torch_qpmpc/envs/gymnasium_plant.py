@@ -148,9 +148,9 @@ class _Guarded(gymnasium.Wrapper):
         return self._seen(y), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        low, high = self.action_space.low, self.action_space.high
-        size = np.nan_to_num(np.abs((low, high)), posinf=0.0).max(0)
-        applied = np.where(np.abs(action) <= ROUNDING * size, 0, action).clip(low, high)
+        space: Any = self.action_space
+        size = np.nan_to_num(np.abs((space.low, space.high)), posinf=0.0).max(0)
+        applied = np.where(np.abs(action) <= ROUNDING * size, 0, action).clip(space.low, space.high)
         try:
             y, reward, terminated, truncated, info = self.env.step(applied.astype(action.dtype))
             reward = np.asarray(reward, float).item()  # from an array of one, too
