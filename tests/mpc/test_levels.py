@@ -10,6 +10,7 @@ import torch
 import torch_qpmpc as qm
 from tests.refused import refused
 from torch_qpmpc.export.library import compiler
+from torch_qpmpc.proofs import Polytope, largest_difference
 
 N = 8
 
@@ -174,8 +175,13 @@ def test_the_only_level_is_feasible_in_single_precision():
     levels = {"action_levels": [(0.1,)], "solver": "daqp"}
     mpc = qm.QPMPC.from_model([[0.9]], [[0.5]], 2, stage_weight=[1.0, 0.1], **levels)
     assert mpc.action_value(torch.ones(1), torch.tensor([0.1])).isfinite()
-    with pytest.raises(qm.SolverError, match="INFEASIBLE"):
+    with pytest.raises(qm.SolverError, match=r"INFEASIBLE: .* check b, lb, ub and levels"):
         mpc.action_value(torch.ones(1), torch.tensor([0.2]))
+    one = "mpc: got one with levels, expected one without, for "
+    with pytest.raises(qm.QPError, match=rf"{one}gradients of closed loops\. Without"):
+        qm.improve(mpc, None)
+    with pytest.raises(qm.QPError, match=f"{one}proofs"):
+        largest_difference(mpc, mpc, Polytope.box([-1.0], [1.0]))
 
 
 def test_relaxed_stages_and_continuous_actions_cost_less_and_keep_the_levels_of_the_others():

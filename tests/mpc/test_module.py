@@ -323,6 +323,7 @@ def test_parameter_groups_have_a_rate_for_each_part():
     for rates, message in (
         ({"cost": 0.1}, "rates: got nothing for C, expected a rate for every learned part"),
         ({"cost": 0.1, "constraint": 1.0}, r"rates: got \['constraint'\], expected names among"),
+        ({"cost": 0.1, "constraints": 0.1, "dynamics": 0.1}, r"rates: got \['dynamics'\].* module"),
     ):
         with pytest.raises(QPError, match=message):
             mpc.parameter_groups(rates)

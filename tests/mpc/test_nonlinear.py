@@ -369,6 +369,8 @@ def test_q_learning_moves_the_parameters_of_the_dynamics():
     gradient = mpc.get_parameter("sequential.dynamics.gravity").grad
     assert gradient is not None
     assert gradient != 0
+    with pytest.raises(QPError, match=r"rates\[dynamics\]: got -1"):
+        mpc.parameter_groups({"cost": 1e-2, "constraints": 1e-3, "dynamics": -1})
     groups = mpc.parameter_groups({"cost": 1e-2, "constraints": 1e-3, "dynamics": 1e-4})
     assert groups[-1]["name"] == "dynamics"
     assert len(groups[-1]["params"]) == 2

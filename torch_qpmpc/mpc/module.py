@@ -536,8 +536,8 @@ class QPMPC(nn.Module):
         """Return parameter groups for an optimiser, one for each learned part of theta.
 
         Args:
-            rates: learning rates by part (``"H"``, ``"C"``, ..), and for other parts by family,
-                ``"cost"`` (H, H_f, q, c, w) and ``"constraints"`` (C, b, G, lb, ub).
+            rates: learning rates by part (``"H"``, ..), for others by family, ``"cost"`` (H, H_f,
+                q, c, w) and ``"constraints"`` (C, b, G, lb, ub), and of a module of ``"dynamics"``.
 
         Raises:
             QPError: a learned part has no rate, or a name or a rate is invalid.

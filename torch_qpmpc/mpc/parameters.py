@@ -101,19 +101,19 @@ def groups(
     known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
     if unknown := set(rates) - known:
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
-    if unused := set(rates) - {*learned, "cost", "constraints", "dynamics"}:
-        expected = f"parts that are learned: {', '.join(learned) or 'none'}"
+    dynamics = [*getattr(module.sequential, "parameters", list)()]
+    if unused := set(rates) - {*learned, "cost", "constraints", *["dynamics"] * bool(dynamics)}:
+        expected = f"parts that are learned: {', '.join(learned) or 'none'}, or a dynamics module"
         raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
     result = []
-    for part in learned:
+    for part in (*learned, *["dynamics"] * ("dynamics" in rates)):
         rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
         if rate is None:
             want = "a rate for every learned part, or its family"
             raise QPError.expected("rates", f"nothing for {part}", want)
         check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
-        result.append({"params": leaves(module, part), "lr": rate, "name": part})
-    if "dynamics" in rates and (own := list(getattr(module.sequential, "parameters", list)())):
-        result.append({"params": own, "lr": rates["dynamics"], "name": "dynamics"})
+        own = dynamics if part == "dynamics" else leaves(module, part)
+        result.append({"params": own, "lr": rate, "name": part})
     return result
 
 

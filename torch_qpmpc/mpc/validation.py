@@ -78,8 +78,8 @@ def check_dynamics(dynamics: Any, learn: Collection[str], levels: Any) -> None:
 def check_no_levels(mpc: Any, what: str) -> None:
     """Raise `QPError` if a QPMPC has levels, for ``what`` needs one QP."""
     if mpc.levels is not None:
-        got, want = "one with action_levels", f"one without, for {what}"
-        remedy = "A scheme with action_levels=None has the relaxed plan."
+        got, want = "one with levels", f"one without, for {what}"
+        remedy = "Without action_levels or u_levels there is the relaxed plan."
         raise QPError.expected("mpc", got, want, remedy)
 
 
