@@ -463,7 +463,7 @@ def _strict(qp: QuadraticProgram, fixed: Tensor, known: Sequence[Tensor]) -> Ten
     theta, lam, n_f = [x.detach() for x in qp.tensors()], known[3], fixed.shape[-1]
     programs, _ = Programs.of(*theta, fixed.detach(), n_kept=n_f)
     condensed = programs.prepared.condensed(n_f)
-    H, G = (to_tensor(x[:, :, n_f:])[programs.group] for x in (condensed.H, condensed.G))
+    H, G = (to_tensor(x)[programs.group, :, n_f:].nan_to_num() for x in (condensed.H, condensed.G))
     size = H[:, n_f:].diagonal(dim1=1, dim2=2).abs().sqrt()  # units in which no other has a part
     size = torch.where(size > 0, size, 1.0).unsqueeze(1)
     H, G = H[:, n_f:] / size / size.mT, G / size
