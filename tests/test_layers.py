@@ -35,7 +35,7 @@ BUDGET = {
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2641,
-    "mpc": 3849,
+    "mpc": 3851,
     "proofs": 1001,
     "qp": 5291,  # caches that notice a called kernel, which the levels pay for
     "study": 586,  # load_run(..).predict, which refinement's second start pays for

@@ -331,9 +331,11 @@ def test_a_state_of_nan_has_no_plan_and_no_part_in_gradients(dynamics):
     inputs = [x for x in mpc.parameters() if x.requires_grad]
     found, want = (torch.autograd.grad(x.value[0], inputs) for x in (solution, alone))
     assert_close(found, want)
-    for x in inputs:
-        x.data.fill_(torch.nan)
-    assert mpc.solve(s.double()).status.tolist() == [Status.INVALID_DATA] * 2
+    physics, state = made(on_failure="mask"), torch.zeros(2, 2).double()
+    for own, part, start in ((mpc, mpc, s.double()), (physics, physics.sequential, state)):
+        for x in part.parameters():
+            x.data.fill_(torch.nan)
+        assert own.solve(start).status.tolist() == [Status.INVALID_DATA] * 2
     with pytest.raises(QPError, match="1 INVALID_DATA"):
         QPMPC.of(1, 1, 5, dynamics=dynamics, **{**options, "on_failure": "raise"})(s.double())
 

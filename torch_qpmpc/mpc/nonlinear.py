@@ -17,7 +17,7 @@ curvature included, in place of H (Fiacco, 1976).
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -289,7 +289,9 @@ class SequentialQP(nn.Module):
         strict = None
         if torch.is_grad_enabled() and any(x.requires_grad for x in (*theta, *self.parameters())):
             own = self.along(flat, known[1], known[2])
-            strict = _strict(own, fixed, known)
+            solved = known[5] == Status.SOLVED
+            strict = torch.zeros_like(solved)
+            strict[solved] = _strict(_taken(own, solved), fixed[solved], known[3][solved])
             value, *rest = Known.apply(*own.tensors(), fixed, None, n_kept, solver, known)
             no = ~strict.unsqueeze(-1)
             known = (value, *(torch.where(no, x.detach(), x) for x in rest[:4]), *rest[4:])
@@ -458,12 +460,12 @@ def _taken(qp: QuadraticProgram, index: Any = slice(None), more: int = 0) -> Qua
     return QuadraticProgram(*parts, check_values=False)
 
 
-def _strict(qp: QuadraticProgram, fixed: Tensor, known: Sequence[Tensor]) -> Tensor:
+def _strict(qp: QuadraticProgram, fixed: Tensor, lam: Tensor) -> Tensor:
     """Return the mask of plans whose Hessian is positive definite where active rows leave them."""
-    theta, lam, n_f = [x.detach() for x in qp.tensors()], known[3], fixed.shape[-1]
+    theta, n_f = qp.tensors(), fixed.shape[-1]
     programs, _ = Programs.of(*theta, fixed.detach(), n_kept=n_f)
     condensed = programs.prepared.condensed(n_f)
-    H, G = (to_tensor(x)[programs.group, :, n_f:].nan_to_num() for x in (condensed.H, condensed.G))
+    H, G = (to_tensor(x)[programs.group, :, n_f:] for x in (condensed.H, condensed.G))
     size = H[:, n_f:].diagonal(dim1=1, dim2=2).abs().sqrt()  # units in which no other has a part
     size = torch.where(size > 0, size, 1.0).unsqueeze(1)
     H, G = H[:, n_f:] / size / size.mT, G / size
