@@ -332,6 +332,7 @@ def test_a_state_of_nan_has_no_plan_and_no_part_in_gradients(dynamics):
     found, want = (torch.autograd.grad(x.value[0], inputs) for x in (solution, alone))
     assert_close(found, want)
     physics, state = made(on_failure="mask"), torch.zeros(2, 2).double()
+    assert physics.sequential is not None
     for own, part, start in ((mpc, mpc, s.double()), (physics, physics.sequential, state)):
         for x in part.parameters():
             x.data.fill_(torch.nan)
