@@ -117,9 +117,7 @@ SHORT = {
     # Benchmarks that can be shortened: one row of each.
     "python -m tests.benchmarks.gradient --write": Short("--only daqp"),
     "python -m tests.benchmarks.rivals": Short("--plants Dosing --sizes 500 --seeds 71"),
-    "python -m tests.benchmarks.closed_loops --seeds 16 17 18 19 20": Short(
-        "--cases Gros-Zanon --seeds 71"
-    ),
+    "python -m tests.benchmarks.closed_loops": Short("--cases Gros-Zanon --seeds 71"),
     "python -m tests.benchmarks.violation": Short("--seeds 1 --steps 50"),
     "python -m tests.benchmarks.micro_controller --write": Short(
         "--seeds 71 --designs 'N = 40' 'N = 3, a lower price'"
