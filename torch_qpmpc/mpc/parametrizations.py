@@ -169,13 +169,13 @@ class Masked(nn.Module):
 
     def __init__(self, mask: Tensor, value: Tensor) -> None:
         super().__init__()
-        self.cpu_mask = mask.cpu()
+        self.cpu_mask = mask.numpy(force=True)  # as a tensor, `Leaves` would take it for theta
         self.place(value.device)
         self.register_buffer("frozen", value.detach().clone())
 
     def place(self, device: torch.device) -> None:
         """Put the mask on a device; a module moved to "meta" has lost it."""
-        self.register_buffer("mask", self.cpu_mask.to(device), persistent=False)
+        self.register_buffer("mask", torch.tensor(self.cpu_mask, device=device), persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
         return torch.where(self.mask, value, self.frozen)
