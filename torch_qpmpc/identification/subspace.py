@@ -555,7 +555,7 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
     X, F = [z @ T.T for z in windows], np.concatenate([y for y, _ in after])
     V = np.concatenate([np.hstack((x[:-1], v)) for x, (_, v) in zip(X, after, strict=True)])
     X1, X0 = np.concatenate([x[1:] for x in X]), np.concatenate(X)
-    AB, C = (np.linalg.lstsq(x.T @ x, x.T @ z)[0].T for x, z in ((V, X1), (X0, F)))
+    AB, C = (np.linalg.lstsq(x.T @ x, x.T @ z, rcond=None)[0].T for x, z in ((V, X1), (X0, F)))
     w, r = X1 - V @ AB.T, F - X0 @ C.T
     Q = w.T @ w / len(w) + 1e-6 * np.eye(order)
     R = r.T @ r / len(r) + 1e-9 * np.eye(len(C))
