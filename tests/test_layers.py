@@ -34,10 +34,10 @@ BUDGET = {
     "experiment": 2886,
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
-    "identification": 2641,
-    "mpc": 3851,
+    "identification": 2659,
+    "mpc": 3859,
     "proofs": 1001,
-    "qp": 5291,  # caches that notice a called kernel, which the levels pay for
+    "qp": 5294,  # caches that notice a called kernel, which the levels pay for
     "study": 586,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

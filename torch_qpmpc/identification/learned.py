@@ -10,6 +10,7 @@ decide for each entry. Networks of what the linear model leaves are worse where 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -70,20 +71,35 @@ class LearnedModel(nn.Module):
 
     def forward(self, x: Tensor, u: Tensor, *d: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         """Return the next x ``(*batch, n_x)``, and the stage cost ``(*batch,)`` if observed."""
-        v = (torch.cat((*d, x, u), -1).to(self.middle) - self.middle) / self.size
-        out = _features(v, len(self.base) > 1 + v.shape[-1]) @ self.base
-        if self.depth:
-            out = out + self.networks(v)
-        after = x + out[..., : self.n_x]
-        return (after, out[..., -1]) if out.shape[-1] > self.n_x else after
+        return self.folded()(x, u, *d)
 
-    def networks(self, v: Tensor) -> Tensor:
-        """Return the mean of the networks at standardised v ``(.., n)``."""
-        W_1, b_1, W_2, b_2, W_3, b_3 = (getattr(self, f"layer_{i}") for i in range(self.depth))
-        hidden = F.silu(torch.addmm(b_1, v.reshape(-1, v.shape[-1]), W_1))
-        hidden = hidden.view(len(hidden), len(W_2), -1).movedim(1, 0)
-        hidden = F.silu(torch.baddbmm(b_2, hidden, W_2)).movedim(0, 1).flatten(1)
-        return torch.addmm(b_3, hidden, W_3).reshape(*v.shape[:-1], -1)
+    def folded(self) -> Callable[..., Tensor | tuple[Tensor, Tensor]]:
+        """Return `forward` with its weights in the units of w = [d; x; u], for call after call."""
+        n, middle, size = len(self.middle), self.middle, self.size
+        layers = [getattr(self, f"layer_{i}") for i in range(self.depth)]
+        W, b, products = self.base[1 : 1 + n], self.base[0], self.base[1 + n :]
+        if layers:
+            W_1, b_1, W_2, b_2, W_3, b_3 = layers
+            W, b = torch.cat((W_1, W), -1), torch.cat((b_1, b + b_3))
+        W = W / size.unsqueeze(-1)
+        b = b - middle @ W
+
+        def step(x: Tensor, u: Tensor, *d: Tensor) -> Tensor | tuple[Tensor, Tensor]:
+            w = torch.cat((*d, x, u), -1).to(middle)
+            rows = w.reshape(-1, n)
+            out = torch.addmm(b, rows, W)
+            if layers:
+                hidden, out = out.tensor_split((len(b_1),), 1)
+                hidden = F.silu(hidden).view(len(rows), len(W_2), -1).transpose(0, 1)
+                hidden = F.silu(torch.baddbmm(b_2, hidden, W_2)).transpose(0, 1).flatten(1)
+                out = torch.addmm(out, hidden, W_3)
+            if len(products):
+                out = out + _products((rows - middle) / size) @ products
+            out = out.reshape(*w.shape[:-1], -1)
+            after = x + out[..., : self.n_x]
+            return (after, out[..., -1]) if out.shape[-1] > self.n_x else after
+
+        return step
 
 
 def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
@@ -166,11 +182,13 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
 
 def _features(v: Tensor, products: bool) -> Tensor:
     """Return 1, v ``(.., n)`` and, with ``products``, those of its entries."""
-    parts = [torch.ones_like(v[..., :1]), v]
-    if products:
-        rows, columns = torch.triu_indices(v.shape[-1], v.shape[-1], device=v.device)
-        parts.append(v[..., rows] * v[..., columns])
+    parts = torch.ones_like(v[..., :1]), v, *([_products(v)] if products else [])
     return torch.cat(parts, -1)
+
+
+def _products(v: Tensor) -> Tensor:
+    rows, columns = torch.triu_indices(v.shape[-1], v.shape[-1], device=v.device)
+    return v[..., rows] * v[..., columns]
 
 
 def _convex(linear: Tensor, features: Tensor, cost: Tensor) -> Tensor:

@@ -177,9 +177,12 @@ class SequentialQP(nn.Module):
         held = k.masked_fill(layout.repeating, 0).cummax(0).values
         self.register_buffer("held", held, persistent=False)
 
-    def stage(self, d: Tensor, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor | None]:
+    def stage(
+        self, d: Tensor, x: Tensor, u: Tensor, dynamics: Callable[..., Any] | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         """Return the next x, and the stage cost if there is one."""
-        out = self.dynamics(x, u, d) if self.layout.n_d else self.dynamics(x, u)
+        f = dynamics or self.dynamics
+        out = f(x, u, d) if self.layout.n_d else f(x, u)
         return out if isinstance(out, tuple) else (out, None)
 
     def outputs(self, w: Tensor) -> Tensor:
@@ -193,8 +196,9 @@ class SequentialQP(nn.Module):
         layout, p = self.layout, p.expand(*u.shape[:-2], -1)
         d = p[..., : layout.n_preview].unflatten(-1, (layout.horizon + 1, layout.n_d)).unbind(-2)
         x, costs, states = p[..., layout.n_preview :], [], []
+        f = self.dynamics.folded() if isinstance(self.dynamics, LearnedModel) else self.dynamics
         for d_k, u_k in zip(d[:-1], u.unbind(-2), strict=True):
-            x, cost = self.stage(d_k, x, u_k)
+            x, cost = self.stage(d_k, x, u_k, f)
             states.append(x.to(u))
             costs += [] if cost is None else [cost.to(u)]
         z = torch.cat((p, torch.cat((u, torch.stack(states, -2)), -1).flatten(-2)), -1)
@@ -308,7 +312,8 @@ class SequentialQP(nn.Module):
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
         hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G[..., of_x] != 0).any(-1)))
         of_u, hard = hard & ~moved, hard & moved  # those of u alone no plan may violate
-        price, sides = torch.where(qp.w.isinf(), 0.0, qp.w), torch.stack((qp.lb, qp.ub)).abs()
+        price = torch.where(qp.w.isinf(), 0.0, qp.w).repeat(B if qp.w.ndim == 1 else 1, 1)
+        sides = torch.stack((qp.lb, qp.ub)).abs()
         bound = torch.where(sides.isfinite(), sides, 0.0).amax(0)
         bound = torch.where(bound > 0, bound, 1.0).expand(B, -1)
 
@@ -318,7 +323,7 @@ class SequentialQP(nn.Module):
             y = times(own.G, z)
             over = torch.maximum(own.lb - y, y - own.ub).relu()
             far = (over > ROUNDING**0.5 * bound[index].unsqueeze(1)) & of_u[index].unsqueeze(1)
-            over = (price.expand(B, -1)[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
+            over = (price[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
             costs = costs + over.sum(-1) + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
             return costs.nan_to_num(torch.inf, torch.inf, torch.inf)
 
@@ -328,9 +333,12 @@ class SequentialQP(nn.Module):
             tries[:, :, 0] = fixed[:, None, n_p:]
         tries = tries[:, :, self.held]
         z, costs = self.simulated(p.unsqueeze(1), tries)
-        least = merit(every, z, costs).amin(1, keepdim=True).abs()
-        price = torch.where(hard, FIRM * least.nan_to_num(posinf=1.0) / bound, price)
-        best = merit(every, z, costs).argmin(1)
+        cost = merit(every, z, costs)
+        if hard.any():
+            least = cost.amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
+            price = torch.where(hard, FIRM * least / bound, price)
+            cost = merit(every, z, costs)
+        best = cost.argmin(1)
         u, z, costs = (x[every, best] for x in (tries, z, costs))
         far = ~(z.abs() < OVERFLOW).all(1)
         z[far, n_p:], costs[far] = 0.0, torch.inf

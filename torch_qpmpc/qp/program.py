@@ -219,14 +219,12 @@ class QuadraticProgram:
             raise QPError.expected(name, got, expected, remedy)
         sizes: dict[str, tuple[str, int]] = {}
         for (name, event), x in zip(EVENT_SHAPES.items(), self.tensors(), strict=True):
-            got, want = f"shape {tuple(x.shape)}", f"shape (*batch, {', '.join(event)})"
             if x.ndim < len(event):
-                raise QPError.expected(name, got, want)
+                raise _misshapen(name, x)
             for symbol, size in zip(event, x.shape[x.ndim - len(event) :], strict=True):
                 source, known = sizes.setdefault(symbol, (name, size))
                 if size != known:
-                    want = f"{want} with {symbol} = {known} as in {source}"
-                    raise QPError.expected(name, got, want)
+                    raise _misshapen(name, x, f" with {symbol} = {known} as in {source}")
 
     def _check_values(self, n_known: int) -> None:
         H, lb, ub, w = self.H, self.lb, self.ub, self.w
@@ -272,6 +270,11 @@ INFINITE = 1e20
 TOLERANCE = 1e-6
 #: Bounds that cross by at most this many machine epsilons are equal.
 CROSSING = 4.0
+
+
+def _misshapen(name: str, x: Tensor, more: str = "") -> QPError:
+    want = f"shape (*batch, {', '.join(EVENT_SHAPES[name])}){more}"
+    return QPError.expected(name, f"shape {tuple(x.shape)}", want)
 
 
 def crossed(lb: Tensor, ub: Tensor) -> Tensor:
