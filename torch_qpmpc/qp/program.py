@@ -229,7 +229,8 @@ class QuadraticProgram:
     def _check_values(self, n_known: int) -> None:
         H, lb, ub, w = self.H, self.lb, self.ub, self.w
         for name in ("H", "q", "c", "C", "b", "G"):
-            if not getattr(self, name).isfinite().all():
+            x = getattr(self, name)
+            if not (x.sum().isfinite() or x.isfinite().all()):  # a sum takes a sixth of the time
                 raise QPError.expected(name, "NaN or inf", "finite entries")
         infinities = {"lb": torch.inf, "ub": -torch.inf, "w": -torch.inf}
         for (name, forbidden), x in zip(infinities.items(), (lb, ub, w), strict=True):

@@ -50,7 +50,8 @@ def recall(active, group, fixed, dual, qps):
     g = g_l_u[:, :d].copy()
     slope, v, free, steps = g, np.zeros((B, d)), np.zeros((B, r)), np.ones(B, np.int64)
     lam, last, force = np.zeros((B, r)), np.zeros((B, r)), np.zeros((B, r))
-    low, high, weight, y, x = np.empty((5, r))
+    # Rows of one array take half as long again: LLVM cannot tell that they do not overlap.
+    low, high, weight, y, x = np.empty(r), np.empty(r), np.empty(r), np.empty(r), np.empty(r)
     sides, held, factor = np.zeros((B, r), np.int64), np.empty(r, np.int64), np.empty((r, r))
     for step in range(PROXIMAL_STEPS if B and dual.shift.max() > 0 else 2):
         v -= products(dual.inverse, group, slope, spans)
