@@ -130,50 +130,42 @@ class Scheme:
             return torch.zeros(0, dtype=torch.bool)
         return ~self.bounds.constraints[0][:, : -self.layout.n_u].any(-1)
 
-    @property
+    @cached_property
     def C_0(self) -> Tensor:
         """The banded C of the model (eq:cband), ``(N n_x, n_z)``."""
-        return self._start[0]
-
-    @property
-    def theta(self) -> dict[str, Tensor]:
-        """The parts of theta by name, without discounts (eq:qpH); w is inf on hard rows."""
-        return self._start[1]
+        with torch.device("cpu"):
+            A, B, E = self.model.matrices(self.layout)
+            return banded_matrix(A, B, self.layout.horizon, E)
 
     @cached_property
-    def _start(self) -> tuple[Tensor, dict[str, Tensor]]:
+    def theta(self) -> dict[str, Tensor]:
+        """The parts of theta by name, without discounts (eq:qpH); w is inf on hard rows."""
+        layout, model, cost = self.layout, self.model, self.cost
         with torch.device("cpu"):
-            return _initial_theta(self)
+            C_0, (A, B, _) = self.C_0, model.matrices(layout)
+            theta = {
+                **cost.hessians(layout, A, B, self.gamma),
+                "q": torch.zeros(layout.n_z, dtype=torch.float64),
+                "c": torch.zeros((), dtype=torch.float64),
+                "C": C_0,
+                "b": model.offsets(layout),
+                **self.bounds.rows(layout),
+            }
+        for name, value in (("q", cost.q), ("c", cost.c), ("C", model.C), ("b", model.b)):
+            if value is None:
+                continue
+            if value.shape != theta[name].shape:
+                got, want = tuple(value.shape), tuple(theta[name].shape)
+                raise QPError.expected(name, f"shape {got}", f"shape {want}")
+            theta[name] = value
+        return theta
 
     def __repr__(self) -> str:
         return f"Scheme({self.layout}, hessian={self.cost.hessian!r}, gamma={self.gamma})"
 
     def __reduce__(self) -> tuple:
-        # Without the cached theta, which follows from the fields.
+        # Without the cached C_0 and theta, which follow from the fields.
         return type(self), tuple(getattr(self, x.name) for x in fields(self))
-
-
-def _initial_theta(scheme: Scheme) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return C_0 and theta."""
-    layout, model, cost = scheme.layout, scheme.model, scheme.cost
-    A, B, E = model.matrices(layout)
-    C_0 = banded_matrix(A, B, layout.horizon, E)
-    theta = {
-        **cost.hessians(layout, A, B, scheme.gamma),
-        "q": torch.zeros(layout.n_z, dtype=torch.float64),
-        "c": torch.zeros((), dtype=torch.float64),
-        "C": C_0,
-        "b": model.offsets(layout),
-        **scheme.bounds.rows(layout),
-    }
-    for name, value in (("q", cost.q), ("c", cost.c), ("C", model.C), ("b", model.b)):
-        if value is None:
-            continue
-        if value.shape != theta[name].shape:
-            got, want = tuple(value.shape), tuple(theta[name].shape)
-            raise QPError.expected(name, f"shape {got}", f"shape {want}")
-        theta[name] = value
-    return C_0, theta
 
 
 def check_names(options: Iterable[str], also: Iterable[str] = (*KEYWORDS, *MODELS)) -> None:
