@@ -415,7 +415,7 @@ class QPMPC(nn.Module):
 
     def readable(self) -> dict[str, Tensor]:
         """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
-        return parameters.readable(self, self.learned)
+        return parameters.readable(self)
 
     def release(self) -> None:
         """Remove the ties of a linear MPC scheme in place, without a change of values.
@@ -542,7 +542,7 @@ class QPMPC(nn.Module):
         Raises:
             QPError: a learned part has no rate, or a name or a rate is invalid.
         """
-        return parameters.groups(self, self.learned, rates)
+        return parameters.groups(self, rates)
 
     def leaves(self, part: str) -> list[nn.Parameter]:
         """Return the parameters of the learned ``part``, such as the factor of ``"H"``.

@@ -8,7 +8,6 @@ coordinates themselves.
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import starmap
@@ -19,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torch_qpmpc.checks import check_kind, check_number, check_tensor
+from torch_qpmpc.checks import NONNEGATIVE, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Masked, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
@@ -57,6 +56,13 @@ def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> 
         leaf.requires_grad_(not frozen)
 
 
+def chain(module: nn.Module, name: str) -> list[nn.Module]:
+    """Return the parametrizations of a part, in order; none if it is plain."""
+    if not parametrize.is_parametrized(module, name):
+        return []
+    return [*module.get_submodule(f"parametrizations.{name}").children()]
+
+
 def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     """Return the parameters of a learned part, such as the factor of H."""
     if not parametrize.is_parametrized(module, name):
@@ -69,21 +75,17 @@ def matrix(module: nn.Module, name: str) -> nn.Parameter | None:
 
     It is None if the part is computed from others, or is not learned.
     """
-    if not parametrize.is_parametrized(module, name):
-        return module._parameters.get(name)
-    own = list(module.get_submodule(f"parametrizations.{name}").children())
-    masked = len(own) == 1 and isinstance(own[0], Masked)
-    return leaves(module, name)[0] if masked else None
+    own = chain(module, name)
+    whole = not own or (len(own) == 1 and isinstance(own[0], Masked))
+    return leaves(module, name)[0] if whole and name in module.learned else None
 
 
-def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
+def readable(module: Any) -> dict[str, Tensor]:
     """Return the learned parts, detached: A, B, E and D for C and G, and shared values once."""
     values = {}
-    for part in learned:
+    for part in module.learned:
         value = getattr(module, part).detach()
-        first = None
-        if parametrize.is_parametrized(module, part):
-            first = next(iter(module.get_submodule(f"parametrizations.{part}").children()))
+        first = next(iter(chain(module, part)), None)
         if isinstance(first, Banded | LinearRows):
             values |= dict(zip(MODELS[type(first)], first.right_inverse(value), strict=False))
         else:
@@ -91,9 +93,7 @@ def readable(module: nn.Module, learned: Collection[str]) -> dict[str, Tensor]:
     return values
 
 
-def groups(
-    module: nn.Module, learned: Collection[str], rates: Mapping[str, float]
-) -> list[dict[str, Any]]:
+def groups(module: Any, rates: Mapping[str, float]) -> list[dict[str, Any]]:
     """Return `QPMPC.parameter_groups`."""
     if not isinstance(rates, Mapping):
         got = type(rates).__name__
@@ -101,7 +101,7 @@ def groups(
     known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
     if unknown := set(rates) - known:
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
-    dynamics = [*getattr(module.sequential, "parameters", list)()]
+    learned, dynamics = module.learned, [*getattr(module.sequential, "parameters", list)()]
     if unused := set(rates) - {*learned, "cost", "constraints", *["dynamics"] * bool(dynamics)}:
         expected = f"parts that are learned: {', '.join(learned) or 'none'}, or a dynamics module"
         raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
@@ -111,7 +111,7 @@ def groups(
         if rate is None:
             want = "a rate for every learned part, or its family"
             raise QPError.expected("rates", f"nothing for {part}", want)
-        check_number(f"rates[{part}]", rate, lambda x: 0 <= x < math.inf, "a finite number >= 0")
+        check_number(f"rates[{part}]", rate, *NONNEGATIVE)
         own = dynamics if part == "dynamics" else leaves(module, part)
         result.append({"params": own, "lr": rate, "name": part})
     return result
@@ -239,13 +239,9 @@ def _with_residuals(
     after = [
         x + residuals[name].to(x.dtype) if name in residuals else x for name, x in before.items()
     ]
-    if not parametrize.is_parametrized(module, part):
-        return after[0]
-    first, *others = module.get_submodule(f"parametrizations.{part}").children()
-    if isinstance(first, Banded | LinearRows):
-        value = for_each(first, after, [x.ndim for x in before.values()])
-    else:
-        value = first(after[0])
-    for parametrization in others:
+    value, own = after[0], chain(module, part)
+    if own and isinstance(own[0], Banded | LinearRows):
+        value = for_each(own.pop(0), after, [x.ndim for x in before.values()])
+    for parametrization in own:
         value = parametrization(value)
     return value

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.parameters import chain
 from torch_qpmpc.mpc.scheme import Scheme
 
 #: The kind of file that `QPMPC.save` writes.
@@ -75,9 +76,8 @@ def check_own(what: str, mpc: Any) -> None:
     ``what`` is to be written: a pickle or a file.
     """
     for name in getattr(mpc, "parametrizations", ()):
-        attached = mpc.get_submodule(f"parametrizations.{name}").children()
         own = mpc._parametrizations_for(name, getattr(mpc, name).detach())
-        if [*map(type, attached)] != [*map(type, own)]:
+        if [*map(type, chain(mpc, name))] != [*map(type, own)]:
             got = f"a parametrization of {name} that is not QPMPC's own"
             remedy = "Save the state_dict, or remove_parametrizations first."
             raise QPError.expected(what, got, "QPMPC's own", remedy)
