@@ -16,7 +16,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_whole, ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.identification.log import Log
+from torch_qpmpc.identification.log import STILL, Log
 from torch_qpmpc.identification.reading import as_log
 from torch_qpmpc.identification.subspace import (
     Fit,
@@ -33,8 +33,6 @@ from torch_qpmpc.identification.subspace import (
 HORIZON = 20
 #: The covariance of a simulation's start, relative to that of the log's states.
 ELSEWHERE = 10.0
-#: An action that the other regressors explain up to this share of its size does not excite.
-STILL = 1e-6
 #: The share of the residuals' variance that the inputs of the same rows may explain.
 LATE = 0.1
 EXCITE = "Add a random signal to the action, independent of the outputs."

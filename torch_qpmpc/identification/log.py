@@ -88,14 +88,15 @@ def named(
     return Log(trajectories, *names)
 
 
+def runs(mask: np.ndarray) -> np.ndarray:
+    """Return the first entry of each run of True, and the one after its last, ``(m, 2)``."""
+    return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
+
+
 def complete(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     """Cut trajectories at rows with missing outputs."""
-    runs = []
-    for one in trajectories:
-        seen = np.concatenate(([False], one.y.isfinite().all(1).numpy(), [False]))
-        edges = np.flatnonzero(np.diff(seen)).reshape(-1, 2)
-        runs += [one.between(int(i), int(k) - 1) for i, k in edges if k - i > 1]
-    return runs
+    cuts = [(one, runs(one.y.isfinite().all(1).numpy())) for one in trajectories]
+    return [one.between(i, k - 1) for one, rows in cuts for i, k in rows.tolist() if k - i > 1]
 
 
 def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:

@@ -30,7 +30,7 @@ from torch_qpmpc.identification.likelihood import (
     starting,
     steady,
 )
-from torch_qpmpc.identification.log import Trajectory
+from torch_qpmpc.identification.log import Trajectory, runs
 from torch_qpmpc.identification.ridge import ridge
 
 #: Iterations of expectation maximisation, of a candidate and of the fit; further ones, their growth
@@ -470,12 +470,8 @@ def _scale(x: Array) -> tuple[Array, Array]:
 
 def _runs(data: Sequence[Signals]) -> list[Signals]:
     """Return the parts of the trajectories in which all outputs are seen."""
-    runs = []
-    for y, v in data:
-        seen = np.concatenate(([False], np.isfinite(y).all(1), [False]))
-        for i, k in np.flatnonzero(np.diff(seen)).reshape(-1, 2):
-            runs.append(Signals(y[i:k], v[i : k - 1]))
-    return [one for one in runs if len(one.v)]
+    cuts = [(y, v, runs(np.isfinite(y).all(1))) for y, v in data]
+    return [Signals(y[i:k], v[i : k - 1]) for y, v, rows in cuts for i, k in rows if k - i > 1]
 
 
 def _filled(data: Sequence[Signals]) -> list[Signals]:

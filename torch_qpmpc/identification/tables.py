@@ -17,7 +17,7 @@ import torch
 from torch_qpmpc.checks import ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds, shows_times
-from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory
+from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory, runs
 
 #: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away, and
 #: so are errors: numbers in two rows or more, but at most the share FEW of them.
@@ -76,9 +76,8 @@ def _split(
     inside = marks[1:] == marks[:-1]
     gaps, dt = gaps_of(times, inside, marks, unit)
     steps = known[:-1] & inside & ~gaps
-    runs = np.flatnonzero(np.diff(np.concatenate(([0], steps, [0])))).reshape(-1, 2)
     edges, used = [], np.zeros(len(values), bool)
-    for i, k in runs:  # from the first row with an output to the last
+    for i, k in runs(steps):  # from the first row with an output to the last
         rows = i + np.flatnonzero(measured[i : k + 1])
         if len(rows) > 1:
             edges.append((rows[0], rows[-1]))
