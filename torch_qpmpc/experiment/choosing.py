@@ -79,13 +79,13 @@ class Choice(NamedTuple):
     @classmethod
     def read(cls, folder: Path) -> Self:
         """Read the table of a run; raise `QPError` if it is missing or damaged."""
+        file = folder / STARTS
         try:
-            exact = dict.fromkeys(("J", "error"), float)  # pandas before 3.1 rounds
-            choice = cls(pd.read_csv(folder / STARTS, index_col="start", converters=exact))
+            choice = cls(pd.read_csv(file, index_col="start", float_precision="round_trip"))
             _ = choice.name, choice.scheme
         except Exception as error:  # damaged files raise errors of any type
             want = "the table of starts that a run wrote"
-            raise damaged(folder / STARTS, error, want, "Start a new run.") from error
+            raise damaged(file, error, want, "Start a new run.") from error
         return choice
 
 

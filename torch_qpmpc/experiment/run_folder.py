@@ -82,7 +82,8 @@ class RunFolder:
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Write the outcome to summary.json, with null for nan and inf, which JSON lacks."""
-        text = json.dumps(_finite(summary), indent=2, allow_nan=False)
+        finite = json.loads(json.dumps(summary), parse_constant=lambda name: None)
+        text = json.dumps(finite, indent=2, allow_nan=False)
         # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
 
@@ -123,8 +124,7 @@ def read_metrics(folder: str | Path) -> pd.DataFrame:
         text = file.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut off")
-        # Python parses numbers to the last digit; pandas before 3.1 does not.
-        table = pd.read_csv(io.StringIO(text), dtype=str).astype(float)
+        table = pd.read_csv(io.StringIO(text), float_precision="round_trip").astype(float)
         return table.astype({"update": int}).set_index("update")
     except (OSError, ValueError, KeyError) as error:
         remedy = "Go on in a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
@@ -152,13 +152,6 @@ def not_null(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: not_null(entry) for key, entry in value.items()}
     return math.nan if value is None else value
-
-
-def _finite(value: Any) -> Any:
-    """Replace numbers that are not finite by None."""
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def unwritable(folder: str | Path, error: OSError) -> QPError:
