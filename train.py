@@ -62,6 +62,7 @@ from torch_qpmpc.experiment.start import learning_start, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import named_task, run_code
 from torch_qpmpc.files import save_file
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.state import KIND
 
 # Absolute, so that a user's script can call main.
@@ -180,7 +181,7 @@ def train(
         if cfg.figures:
             draw_outcome(run, gate.mpc, evaluation)
         if cfg.gate and not judged.get("gate/accepted"):
-            evaluation.evaluate(learner.policy, "candidate")
+            evaluation.evaluate(warm_policy(mpc), "candidate")
         summary = run_summary(evaluation, tally, gate)
         summary |= {} if identified is None else identified.summary
         run.finish(summary)

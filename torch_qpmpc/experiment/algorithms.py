@@ -24,7 +24,6 @@ from torch_qpmpc.learning.gauss_newton import GaussNewton
 from torch_qpmpc.learning.operators import (
     POLICY_ACTIVE_SET,
     QPActorValueOperator,
-    in_closed_loop,
     preview_key,
 )
 from torch_qpmpc.learning.penalties import DeviationPenalty, Penalties, SystemIdentificationPenalty
@@ -43,7 +42,6 @@ class Learner:
         loss_module: the loss.
         actor: maps observation to action, without exploration.
         penalties: those that are on.
-        n_preview: entries of the preview, with which p begins.
     """
 
     learn: Update
@@ -52,12 +50,6 @@ class Learner:
     optimizer: torch.optim.Optimizer
     scheduler: LambdaLR
     penalties: Penalties
-    n_preview: int = 0
-
-    @property
-    def policy(self) -> Callable[[Tensor], Tensor]:
-        """The actor as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.actor, self.n_preview)
 
     def centre(self, replay: Replay) -> float:
         """Make the mean TD error of the stored steps zero by c alone; return the change of c.
@@ -90,7 +82,6 @@ def make_learner(cfg: Config, operator: QPActorValueOperator) -> Learner:
         optimizer,
         scheduler,
         penalties,
-        n_preview=(mpc.horizon + 1) * mpc.n_d,
     )
 
 

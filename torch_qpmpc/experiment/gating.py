@@ -15,7 +15,7 @@ from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.run_folder import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
-from torch_qpmpc.learning.operators import in_closed_loop
+from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The most pairs of a comparison. A run's later ones need more, as they share one alpha.
@@ -59,7 +59,7 @@ class RunGate:
     @property
     def policy(self) -> Callable[[Tensor], Tensor]:
         """The policy that is kept, as a function from p to a, for one closed loop."""
-        return in_closed_loop(self.kept, self._learner.n_preview)
+        return warm_policy(self.mpc)
 
     @property
     def mpc(self) -> QPMPC:
@@ -80,8 +80,7 @@ class RunGate:
     def _costs(self, actor: Any, seed: int) -> Tensor:
         if self._cfg.gate == "plant":
             seed = int(np.random.SeedSequence([seed, self.compared]).generate_state(1)[0])
-        policy = in_closed_loop(actor, self._learner.n_preview)
-        costs = evaluate(self._cfg, policy, self._physics, seed).costs
+        costs = evaluate(self._cfg, warm_policy(actor.module), self._physics, seed).costs
         self.compared += costs.numel()
         return costs.sum(0)
 
