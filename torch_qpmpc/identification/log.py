@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -88,7 +88,7 @@ def named(
     return Log(trajectories, *names)
 
 
-def runs(mask: np.ndarray) -> np.ndarray:
+def runs(mask: Any) -> np.ndarray:
     """Return the first entry of each run of True, and the one after its last, ``(m, 2)``."""
     return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
 

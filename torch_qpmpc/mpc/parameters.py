@@ -70,7 +70,7 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
 
 
-def matrix(module: nn.Module, name: str) -> nn.Parameter | None:
+def matrix(module: Any, name: str) -> nn.Parameter | None:
     """Return the parameter with the entries of a part, all or masked.
 
     It is None if the part is computed from others, or is not learned.
