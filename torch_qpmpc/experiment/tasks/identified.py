@@ -161,14 +161,9 @@ def identified_scheme(cfg: Config, scheme: Scheme, start: Start) -> Scheme:
         cost = _observed_cost(cfg, start)
         if start.riccati or cfg.task.terminal_weight == "riccati":
             cost = regulator_cost(cost, start, scheme.gamma)
-    model, layout = _scheme_model(start.model), start.layout
+    model, layout = Model(*start.model[:4]), start.layout
     scheme = replace(scheme, layout=layout, model=model, cost=cost)
     return scheme if start.action is None else _holding(scheme, start)
-
-
-def _scheme_model(model: Innovations) -> Model:
-    """Return the model of a scheme."""
-    return Model(*(torch.tensor(part) for part in (model.A, model.B, model.E, model.offset)))
 
 
 def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
@@ -264,8 +259,7 @@ def nominal_mpcs(cfg: Config, physics: AnyPlant, data: Sequence[TensorDictBase])
             with suppress(QPError):
                 start = Start(data, model, layout.horizon, cost=fit)
                 costs.append(regulator_cost(costs[0], start, 1.0))
-    found = _scheme_model(model)
-    schemes = [replace(scheme, model=found, cost=cost, gamma=1.0) for cost in costs]
+    schemes = [replace(scheme, model=Model(*model[:4]), cost=cost, gamma=1.0) for cost in costs]
     mpcs = [
         QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
         for scheme in schemes
