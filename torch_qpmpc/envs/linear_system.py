@@ -53,15 +53,32 @@ def check_rng(rng: Rng) -> None:
         raise QPError.expected("rng", repr(rng), "a NumPy or torch generator", remedy)
 
 
-def moved(plant: Any, device: torch.device | str | None) -> Any:
-    """Return a plant, a dataclass, with its tensors on ``device``."""
-    values = {f.name: getattr(plant, f.name) for f in fields(plant)}
-    tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
-    return replace(plant, **tensors)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Actuated:
+    """A plant's tensors, with the bounds of its action, ``(n_u,)``."""
+
+    lb_a: Tensor
+    ub_a: Tensor
+
+    def to(self, device: torch.device | str | None) -> Self:
+        """Return the same plant with its tensors on ``device``."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        tensors = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **tensors)
+
+    @property
+    def n_u(self) -> int:
+        """Entries of the action."""
+        return len(self.lb_a)
+
+    def applied(self, a: Tensor) -> Tensor:
+        """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
+        check_tensor("a", a, self.n_u)
+        return a.to(self.lb_a).clamp(self.lb_a, self.ub_a)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LinearSystem(ABC):
+class LinearSystem(Actuated, ABC):
     """The physics in float64, to which methods convert their tensors.
 
     Args:
@@ -100,8 +117,6 @@ class LinearSystem(ABC):
     B: Tensor
     lb_s: Tensor
     ub_s: Tensor
-    lb_a: Tensor
-    ub_a: Tensor
 
     def __post_init__(self) -> None:
         remedy = "Use torch.tensor(.., dtype=torch.float64)."
@@ -124,10 +139,6 @@ class LinearSystem(ABC):
         for of in ("s", "a"):
             if not (getattr(self, f"lb_{of}") <= getattr(self, f"ub_{of}")).all():
                 raise QPError.expected(f"lb_{of}", f"lb_{of} > ub_{of}", "lower bounds <= upper")
-
-    def to(self, device: torch.device | str | None) -> Self:
-        """Return the same physics with its tensors on ``device``."""
-        return moved(self, device)
 
     @abstractmethod
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
@@ -152,11 +163,6 @@ class LinearSystem(ABC):
     def true_model(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return A, B and the offset, which is the mean of the noise."""
         return self.A, self.B, self.mean_noise()
-
-    def applied(self, a: Tensor) -> Tensor:
-        """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
-        check_tensor("a", a, len(self.lb_a))
-        return a.to(self.A).clamp(self.lb_a, self.ub_a)
 
     def violation(self, s: Tensor) -> Tensor:
         """Return how far s ``(*batch, n_x)`` is outside its bounds, summed, ``(*batch,)``."""

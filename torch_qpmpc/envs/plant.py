@@ -18,9 +18,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torch_qpmpc.checks import check_kind, check_tensor, check_whole
+from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
-from torch_qpmpc.envs.linear_system import Rng, moved
+from torch_qpmpc.envs.linear_system import Actuated, Rng
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.identification.innovations import Innovations
 
@@ -29,7 +29,7 @@ EPISODES = 1024
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Plant(ABC):
+class Plant(Actuated, ABC):
     """A plant in float64, and what its controller is shown.
 
     Args:
@@ -43,8 +43,6 @@ class Plant(ABC):
         QPError: if a number is out of range.
     """
 
-    lb_a: Tensor
-    ub_a: Tensor
     n_y: int
     n_d: int = 0
     horizon: int = 1
@@ -55,11 +53,6 @@ class Plant(ABC):
             check_whole(name, getattr(self, name), least)
 
     @property
-    def n_u(self) -> int:
-        """Entries of the action."""
-        return len(self.lb_a)
-
-    @property
     def n_x(self) -> int:
         """Entries of the output, or of the model's state, that a controller sees."""
         return self.n_y if self.observer is None else len(self.observer.A)
@@ -68,10 +61,6 @@ class Plant(ABC):
     def n_preview(self) -> int:
         """Entries of the known signals d_k, .., d_{k+N}."""
         return (self.horizon + 1) * self.n_d
-
-    def to(self, device: torch.device | str | None) -> Self:
-        """Return the same plant with its tensors on ``device``."""
-        return moved(self, device)
 
     def observed(self, model: Innovations | None) -> Self:
         """Return this plant with the estimate of the state of ``model`` in place of the output."""
@@ -96,11 +85,6 @@ class Plant(ABC):
     @abstractmethod
     def step(self, x: Tensor, u: Tensor, w: Tensor) -> Tensor:
         """Return x+ = f(x, u, w) ``(*batch, n_x)``, for the applied u."""
-
-    def applied(self, a: Tensor) -> Tensor:
-        """Return the applied action: a ``(*batch, n_u)``, clipped to its bounds."""
-        check_tensor("a", a, self.n_u)
-        return a.to(self.lb_a).clamp(self.lb_a, self.ub_a)
 
     def vectorised(self, num_envs: int, max_steps: int, seed: int) -> EnvBase:
         """Make a TorchRL environment of ``num_envs`` episodes of ``max_steps`` steps.
