@@ -224,12 +224,12 @@ def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
     if not parametrize.is_parametrized(module, part):
         learned = part in module._parameters
         return {} if part in SIGNED and not learned else {part: getattr(module, part)}
-    chain: Any = module.get_submodule(f"parametrizations.{part}")
-    names = MODELS.get(type(next(iter(chain.children()))), (part,))
+    own: Any = module.get_submodule(f"parametrizations.{part}")
+    names = MODELS.get(type(next(iter(own.children()))), (part,))
     # By attribute, as a functional call replaces parameters with plain tensors.
-    if hasattr(chain, "original"):
-        return {names[0]: chain.original}
-    originals = (getattr(chain, f"original{i}", None) for i in range(len(names)))
+    if hasattr(own, "original"):
+        return {names[0]: own.original}
+    originals = (getattr(own, f"original{i}", None) for i in range(len(names)))
     return {name: x for name, x in zip(names, originals, strict=True) if x is not None}
 
 
