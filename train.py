@@ -32,7 +32,6 @@ from tqdm import tqdm
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import (
-    batches,
     make_collector,
     make_learner,
     make_operator,
@@ -102,7 +101,7 @@ def train(
 
     # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
-    stream = batches(collector)
+    stream = iter(collector)
     warm_up = warm_up_batches(cfg)
 
     with contextlib.ExitStack() as stack:

@@ -8,7 +8,7 @@ import torch
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPActorValueOperator, SolveLog
-from torch_qpmpc.experiment.algorithms import batches, make_collector
+from torch_qpmpc.experiment.algorithms import make_collector
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
@@ -23,7 +23,7 @@ def collect(cfg: Config, count: int) -> tuple[Any, Any]:
     collector = make_collector(cfg, physics, QPActorValueOperator(mpc).get_policy_operator())
     torch.manual_seed(0)
     try:
-        found: list[Any] = [b.clone() for b in itertools.islice(batches(collector), count)]
+        found: list[Any] = [b.clone() for b in itertools.islice(collector, count)]
     finally:
         collector.shutdown()
     return torch.cat(found, dim=1), mpc
@@ -55,7 +55,7 @@ def test_a_collector_carries_active_sets_from_step_to_step(task):
     torch.manual_seed(0)
     try:
         with SolveLog() as log:
-            for batch, _ in zip(batches(collector), range(4), strict=False):
+            for batch, _ in zip(collector, range(4), strict=False):
                 assert POLICY_ACTIVE_SET not in batch
                 assert POLICY_ACTIVE_SET not in batch["next"]
                 last = batch["observation"][:, -1]

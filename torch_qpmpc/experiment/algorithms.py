@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
@@ -131,15 +130,22 @@ def evaluate(
 
 
 def make_collector(cfg: Config, physics: AnyPlant, actor: TensorDictModuleBase) -> Collector:
-    """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration."""
+    """Make the collector of ``actor``'s vectorised episodes with Gaussian exploration.
+
+    The actor's active sets are left out of its batches: only the next step uses them.
+    """
     env = physics.vectorised(cfg.num_envs, cfg.task.episode_steps, seed=cfg.seed)
     exploration = AdditiveGaussianModule(
         env.action_spec, sigma_init=cfg.exploration_std, sigma_end=cfg.exploration_std
     )
     policy = TensorDictSequential([actor, exploration])
-    options: Any = {"auto_register_policy_transforms": False}
-    frames = cfg.num_envs * cfg.steps_per_update
-    return Collector(env, policy, frames_per_batch=frames, total_frames=-1, **options)
+    options: Any = {
+        "frames_per_batch": cfg.num_envs * cfg.steps_per_update,
+        "total_frames": -1,
+        "auto_register_policy_transforms": False,
+        "postproc": lambda batch: batch.exclude(POLICY_ACTIVE_SET),
+    }
+    return Collector(env, policy, **options)
 
 
 def make_run_replay(cfg: Config, mpc: QPMPC) -> Replay:
@@ -160,12 +166,3 @@ def make_run_replay(cfg: Config, mpc: QPMPC) -> Replay:
 def warm_up_batches(cfg: Config) -> int:
     """Return the number of batches, of ``steps_per_update`` steps each, of a run's warm-up."""
     return -(-cfg.warmup_steps // cfg.steps_per_update)
-
-
-def batches(collector: Collector) -> Iterator[TensorDictBase]:
-    """Yield batches of ``(num_envs, steps_per_update)`` transitions under the newest theta.
-
-    The policy's active sets are left out: only its next step uses them.
-    """
-    for batch in collector:
-        yield batch.exclude(POLICY_ACTIVE_SET)
