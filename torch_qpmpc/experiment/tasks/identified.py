@@ -52,10 +52,10 @@ NETWORKS = (
 class Start(NamedTuple):
     """A log of the task's plant, and the model and, if the task has none, the cost fitted to it.
 
-    The observation of ``log`` is the state of ``model``: where the plant is ``observed``, the
-    estimate by its filter; ``order`` is as in `fit_state_space`. ``cut`` is the number of the log's
-    episodes that blow up. ``action`` ``(n_u,)`` is what the policy holds, by a cost of its
-    own. ``choice`` is the table that it was chosen from, ``dynamics`` the networks in place of
+    The observation of ``log`` is the state of ``model``: where the plant has an ``observer``, which
+    is ``model`` then, its estimate; ``order`` is as in `fit_state_space`. ``cut`` is the number of
+    the log's episodes that blow up. ``action`` ``(n_u,)`` is what the policy holds, by a cost of
+    its own. ``choice`` is the table that it was chosen from, ``dynamics`` the networks in place of
     ``model``. ``riccati`` is True if the cost of x_N is the regulator's.
     """
 
@@ -63,18 +63,13 @@ class Start(NamedTuple):
     model: Innovations
     horizon: int
     order: int = 0
-    observed: bool = False
+    observer: Innovations | None = None
     cost: StageCost | None = None
     cut: int = 0
     action: Tensor | None = None
     choice: Choice | None = None
     dynamics: LearnedModel | None = None
     riccati: bool = False
-
-    @property
-    def observer(self) -> Innovations | None:
-        """The model of the plant's observer, if it has one."""
-        return self.model if self.observed else None
 
     @property
     def layout(self) -> Layout:
@@ -101,7 +96,7 @@ class Start(NamedTuple):
     def summary(self) -> dict[str, Any]:
         """The entries of summary.json: episodes cut, the model's order, and the cost's fit."""
         entries: dict[str, Any] = {"log_episodes_cut": self.cut}
-        entries |= {"order": len(self.model.A)} if self.observed else {}
+        entries |= {"order": len(self.model.A)} if self.observer is not None else {}
         entries |= {} if self.choice is None else self.choice.summary
         return entries | ({} if self.cost is None else {"R2_cost": self.cost.R2})
 
@@ -128,7 +123,8 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
 
     fit = fit_state_space(data.trajectories, order)
     steps = estimated(log, fit.model) if observed else log
-    start = Start(steps, fit.model, cfg.task.horizon, fit.order, observed, cut=cut)
+    observer = fit.model if observed else None
+    start = Start(steps, fit.model, cfg.task.horizon, fit.order, observer, cut=cut)
     scheme = find_task(cfg.task).wrong_scheme(cfg, start.plant(physics))
     if scheme.cost.stage_weight is not None:
         return start
@@ -154,24 +150,26 @@ def nonlinear_start(cfg: Config, physics: AnyPlant, start: Start) -> Start | Non
 
 def identified_scheme(cfg: Config, scheme: Scheme, start: Start) -> Scheme:
     """Return ``scheme`` with the identified model and, if it has no weight, the log's cost."""
-    cost = scheme.cost
+    cost, model, layout, gamma = scheme.cost, start.model, start.layout, cfg.task.gamma
     if cost.stage_weight is None and start.dynamics is not None:
         cost = _cost_of_networks(cfg, start)
     elif cost.stage_weight is None:
-        cost = _observed_cost(cfg, start)
+        assert start.cost is not None
+        cost = scheme_cost(start.cost, layout, gamma, cfg.task.hessian)
+        # After x_N, the constant has the log's mean.
+        cost = replace(cost, c=cost.c + _ahead(start.log, gamma, layout.horizon + 1))
         if start.riccati or cfg.task.terminal_weight == "riccati":
-            cost = regulator_cost(cost, start, scheme.gamma)
-    model, layout = Model(*start.model[:4]), start.layout
-    scheme = replace(scheme, layout=layout, model=model, cost=cost)
+            cost = regulator_cost(cost, start.cost, model, layout, scheme.gamma)
+    scheme = replace(scheme, layout=layout, model=Model(*model[:4]), cost=cost)
     return scheme if start.action is None else _holding(scheme, start)
 
 
-def regulator_cost(cost: Cost, start: Start, gamma: float) -> Cost:
-    """Return ``cost``, fitted to a log, with the regulator's cost to go at x_N."""
-    layout, model = start.layout, start.model
-    A, B, offset = (torch.tensor(part) for part in (model.A, model.B, model.offset))
-    first, fitted = cost.q[: -layout.n_x], start.cost
-    assert fitted is not None
+def regulator_cost(
+    cost: Cost, fitted: StageCost, model: Innovations, layout: Layout, gamma: float
+) -> Cost:
+    """Return ``cost``, ``fitted`` to a log, with the regulator's cost to go at x_N."""
+    A, B, offset = map(torch.tensor, (model.A, model.B, model.offset))
+    first = cost.q[: -layout.n_x]
     if layout.n_d:
         P = terminal_riccati(A, B, cost.stage_weight, gamma, layout)
         return replace(cost, terminal_weight=P, q=F.pad(first, (0, layout.n_x)))
@@ -207,14 +205,6 @@ def _holding(scheme: Scheme, start: Start) -> Scheme:
     weight = weight.expand_as(scheme.cost.stage_weight)  # one per stage where the scheme has that
     cost = Cost(weight, zero, scheme.cost.hessian, q=q, c=c)
     return replace(scheme, cost=cost, bounds=replace(scheme.bounds, state_bounds=None))
-
-
-def _observed_cost(cfg: Config, start: Start) -> Cost:
-    """Return the cost of a scheme from the start's; the constant has the log's mean after x_N."""
-    gamma, layout, log = cfg.task.gamma, start.layout, start.log
-    assert start.cost is not None
-    cost = scheme_cost(start.cost, layout, gamma, cfg.task.hessian)
-    return replace(cost, c=cost.c + _ahead(log, gamma, layout.horizon + 1))
 
 
 def _cost_of_networks(cfg: Config, start: Start) -> Cost:
@@ -257,8 +247,7 @@ def nominal_mpcs(cfg: Config, physics: AnyPlant, data: Sequence[TensorDictBase])
         costs = [scheme_cost(fit, layout, 1.0, cfg.task.hessian)]
         if not diagonal:
             with suppress(QPError):
-                start = Start(data, model, layout.horizon, cost=fit)
-                costs.append(regulator_cost(costs[0], start, 1.0))
+                costs.append(regulator_cost(costs[0], fit, model, layout, 1.0))
     schemes = [replace(scheme, model=Model(*model[:4]), cost=cost, gamma=1.0) for cost in costs]
     mpcs = [
         QPMPC(scheme, learn=(), structure="tied", solver=cfg.solver, on_failure="mask")
