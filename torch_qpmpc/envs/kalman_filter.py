@@ -156,13 +156,9 @@ class KalmanFilter(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Add the estimate to the inputs of a step, so that batched environments pass it on."""
-        state_spec = input_spec["full_state_spec"]
-        if state_spec is None:
-            state_spec = Composite(shape=input_spec.shape)
         assert self.parent is not None
         for key, spec in self._specs(self.parent.full_observation_spec).items():
-            state_spec[key] = spec
-        input_spec["full_state_spec"] = state_spec
+            input_spec["full_state_spec", key] = spec
         return input_spec
 
     def _specs(self, observation_spec: Composite) -> dict[Any, Unbounded]:
