@@ -12,6 +12,7 @@ covariance of its own state, which knows all earlier outputs, given those that t
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -240,9 +241,9 @@ def spread(F, own, at, same):
     return N[: d + 1], back
 
 
-def alike(seen: Array) -> list[list[int]]:
-    """Return the places of trajectories ``(G, T, n_y)`` with the same missing outputs together."""
-    groups: dict[bytes, list[int]] = {}
-    for i, one in enumerate(seen):
-        groups.setdefault(one.tobytes(), []).append(i)
+def grouped(keys: Iterable[Hashable]) -> list[list[int]]:
+    """Return the places of equal keys together, in the order of the first ones."""
+    groups: dict[Hashable, list[int]] = {}
+    for i, key in enumerate(keys):
+        groups.setdefault(key, []).append(i)
     return list(groups.values())

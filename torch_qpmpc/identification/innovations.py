@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_qpmpc.identification.filter import Array, Course, alike, course, filtered
+from torch_qpmpc.identification.filter import Array, Course, course, filtered, grouped
 
 #: A gain that differs from the steady one by less than this share has settled.
 SETTLED = 1e-9
@@ -93,7 +93,7 @@ class Innovations(NamedTuple):
         y = y.reshape(-1, *y.shape[-2:])
         inputs = self.inputs(u, d).reshape(len(y), y.shape[1] - 1, n)
         seen, xi = ~np.isnan(y), np.empty((*y.shape[:2], n))
-        for rows in alike(seen):
+        for rows in grouped(one.tobytes() for one in seen):
             run = self.course(seen[rows[0]])
             signals = (np.moveaxis(x[rows], 0, 1) for x in (y, inputs))
             parts = map(np.ascontiguousarray, (self.A, self.C, run.K, run.at, *signals, self.x0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -14,9 +13,9 @@ from torch_qpmpc.identification.filter import (
     Array,
     Course,
     Smoothed,
-    alike,
     course,
     filtered,
+    grouped,
     smoothed,
 )
 from torch_qpmpc.identification.innovations import Innovations
@@ -48,12 +47,9 @@ class Noisy(NamedTuple):
 
 def batches(data: Sequence[Signals]) -> list[tuple[list[int], Array, Array]]:
     """Return trajectories of the same length together, with their places."""
-    groups: dict[int, list[int]] = defaultdict(list)
-    for i, one in enumerate(data):
-        groups[len(one.v)].append(i)
     return [
         (group, np.stack([data[i].y for i in group]), np.stack([data[i].v for i in group]))
-        for group in groups.values()
+        for group in grouped(len(one.v) for one in data)
     ]
 
 
@@ -74,10 +70,10 @@ class Group(NamedTuple):
 def groups_of(data: Sequence[Signals]) -> list[Group]:
     groups = []
     for places, y, v in batches(data):
-        for rows in alike(np.isnan(y)):
+        for rows in grouped(one.tobytes() for one in np.isnan(y)):
             seen = ~np.isnan(y[rows[0]])
-            kinds, kind = np.unique(seen @ 2.0 ** np.arange(y.shape[-1]), return_inverse=True)
-            first = [int((kind == i).argmax()) for i in range(len(kinds))]
+            codes = seen @ 2.0 ** np.arange(y.shape[-1])
+            _, first, kind = np.unique(codes, return_index=True, return_inverse=True)
             own = [places[i] for i in rows]
             groups.append(Group(y[rows], v[rows], seen[first], kind, own))
     return groups
