@@ -272,11 +272,8 @@ class QPMPC(nn.Module):
             layout = Layout(len(log.outputs), len(log.inputs), horizon, n_d=len(log.known))
             fitted = fit_rewards(trajectories, layout, hessian == "diagonal", model)
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
-            arguments["stage_weight"] = cost.stage_weight
-            if arguments.get("terminal_weight") is None:
-                arguments["terminal_weight"] = cost.terminal_weight
             given = {name: x for name, x in arguments.items() if x is not None}
-            arguments = {"q": cost.q, "c": cost.c} | given
+            arguments = {**vars(cost), **given}
         return cls.of(**arguments)
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
