@@ -125,7 +125,7 @@ def train(
             tally = restore(state, mpc, learner, gate, collector, replay)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            evaluation.evaluate(gate.policy)
+            evaluation.evaluate(warm_policy(gate.mpc))
             # The last checkpoint has no transitions to identify a model from.
             if J := run.column(f"eval/J_{IDENTIFICATION}")[1]:
                 evaluation.rivals[IDENTIFICATION] = J[-1]
@@ -163,7 +163,7 @@ def train(
             last = update == cfg.updates
             if last or update % cfg.eval_interval == 0:
                 if changed:
-                    evaluation.evaluate(gate.policy)
+                    evaluation.evaluate(warm_policy(gate.mpc))
                     changed = False
                 if last:
                     evaluation.identify(partial(transitions, identified, replay))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +54,6 @@ class RunGate:
     def acting(self) -> Any:
         """The policy that collects transitions."""
         return self.kept if self._cfg.gate in ACTING else self._learner.actor
-
-    @property
-    def policy(self) -> Callable[[Tensor], Tensor]:
-        """The policy that is kept, as a function from p to a, for one closed loop."""
-        return warm_policy(self.mpc)
 
     @property
     def mpc(self) -> QPMPC:
