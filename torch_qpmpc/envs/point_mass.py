@@ -18,7 +18,6 @@ from torch_qpmpc.envs.linear_system import (
     LinearSystemEnv,
     LinearSystemGymEnv,
     Rng,
-    check_rng,
     float64,
     normal,
     uniform,
@@ -105,10 +104,8 @@ class PointMass(LinearSystem):
         """
         if isinstance(rng, torch.Generator):
             return self.start_range * (2 * uniform(rng, count, 4) - 1)
-        check_rng(rng)
         ranges = (self.start_position, self.start_velocity)
-        draws = [rng.uniform(-r, r, size=(count, 2)) for r in ranges]
-        return torch.as_tensor(np.hstack(draws)).to(self.A)
+        return torch.cat([2 * r * uniform(rng, count, 2) - r for r in ranges], -1).to(self.A)
 
     def draw(self, rng: Rng, count: int) -> Tensor:
         """Draw standard normal numbers ``(count, 4)`` from ``rng``."""
