@@ -30,15 +30,15 @@ BUDGET = {
     ".": 417,
     "analysis": 851,
     "control": 4824,  # nonlinear plants
-    "envs": 1427,
-    "experiment": 2886,
+    "envs": 1410,
+    "experiment": 2839,
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
-    "identification": 2659,
-    "mpc": 3859,
+    "identification": 2632,
+    "mpc": 3836,
     "proofs": 1001,
-    "qp": 5296,  # caches that notice a called kernel, which the levels pay for
-    "study": 586,  # load_run(..).predict, which refinement's second start pays for
+    "qp": 5291,  # caches that notice a called kernel, which the levels pay for
+    "study": 585,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.
 RESERVED = {
