@@ -66,6 +66,30 @@ def test_the_order_of_a_short_log_in_one_piece_is_enough(log, new, order):
     assert found.R2[-1].item() > 0.99 * (1 - off(told, new) ** 2 / log["y"].var())
 
 
+def test_an_order_is_that_of_a_dead_time_beyond_the_horizons_that_decide():
+    """The singular vectors of twenty predictions were at most twenty states: it was 0."""
+    rng, delay = np.random.default_rng(0), 24
+    u, y = rng.uniform(-1, 1, 60).repeat(10), np.zeros(601)
+    for k in range(600):
+        y[k + 1] = 0.8 * y[k] + (0.5 * u[k - delay] if k >= delay else 0.0)
+    y += 0.02 * rng.normal(size=601)
+    found = qm.identify({"y": y, "u": u}, order=delay + 1)
+    assert found.fit.order == delay + 1
+    assert found.R2[-1].item() > 0.99
+
+
+def test_an_order_above_what_the_log_shows_is_what_it_shows():
+    """Without noise two states are nearly all: the outputs alone were the model of order 4."""
+    rng, x, y = np.random.default_rng(0), np.zeros(2), np.zeros(401)
+    u = rng.uniform(-1, 1, 400)
+    for k in range(400):
+        x = np.array([[0.8, 0.3], [0.0, 0.5]]) @ x + [0.0, u[k]]
+        y[k + 1] = x[0]
+    found = qm.identify({"y": y, "u": u}, order=4)
+    assert 2 <= found.fit.order < 4
+    assert found.R2[-1].item() > 0.999
+
+
 def test_the_report_names_orders_that_the_log_does_not_tell_apart():
     rows = [(0, 0, 3.0, 0.1), (1, 2, 0.05, 0.04), (2, 2, 0.0, 0.0), (3, 2, 0.003, 0.0)]
     rows = [subspace.Candidate(*row) for row in rows]

@@ -170,8 +170,8 @@ def identify(
             "observation")``. Done flags and the ids of trajectories are respected. A list or lazy
             stack of logs may have different lengths.
         horizon: N, the number of steps of the predictions that are reported.
-        order: the number of states but disturbances; by default errors of held-out predictions
-            choose it. 0: the state is the outputs, measured exactly.
+        order: the number of states but disturbances, or the most that the log shows; by default
+            errors of held-out predictions choose it. 0: the state is the outputs, measured exactly.
         n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
             they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``; all of them by default.
@@ -210,8 +210,7 @@ def measured_model(
 def model_arguments(model: Innovations) -> dict[str, Any]:
     """Return the sizes and matrices of a model as arguments of `QPMPC.of`."""
     sizes = {"n_x": len(model.A), "n_u": model.B.shape[1], "n_d": model.E.shape[1]}
-    parts = ("A", "B", "E", "offset")
-    return sizes | {name: torch.tensor(getattr(model, name)) for name in parts}
+    return sizes | {name: torch.tensor(getattr(model, name)) for name in ("A", "B", "E", "offset")}
 
 
 def check_excitation(log: Log) -> None:

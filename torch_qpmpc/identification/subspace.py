@@ -121,7 +121,7 @@ def fit_state_space(
         parts = [readable(x, data) if order else x for x in found[rows.index(best)][1]]
     model = measured(data, filled)
     if order:
-        par = em(_states(_predictor(filled, lags), order), data, SOME)
+        par = em(_states(_predictor(filled, lags, order), order), data, SOME)
         likely, model = em(par, data, MANY, GROWTH, GAIN), steady(par)
         if likely is not par:
             held, many = _Held(trajectories), steady(likely)
@@ -241,9 +241,9 @@ class _Held:
         return np.concatenate(found)
 
 
-def _feasible(starts: Sequence[Sequence[Signals]]) -> tuple[int, ...]:
-    """Return the lags whose windows are in at least half of the steps."""
-    found = {*LAGS}
+def _feasible(starts: Sequence[Sequence[Signals]], longest: int) -> tuple[int, ...]:
+    """Return the lags, also ``longest``, whose windows are in at least half of the steps."""
+    found = {*LAGS, max(*LAGS, longest)}
     for data in starts:
         steps, width = np.array([len(v) for _, v in data]), sum(x.shape[1] for x in data[0])
         least = max(steps.sum() / 2, 2 * width)
@@ -276,12 +276,13 @@ def _compare(
         return [*map(Candidate, *zip(*found, strict=True), scores.tolist(), errors.tolist())]
 
     found = {(0, 0): [*map(measured, folds, bases)]}
-    pars, feasible = {}, _feasible([_runs(base) for base in bases])
+    pars, feasible = {}, _feasible([_runs(base) for base in bases], max(orders))
     if len(orders) == 1 or judged(found)[0].score > np.log(EXACT) + MARGIN:
         for p in feasible if any(orders) else ():
-            starts = [_predictor(base, p) for base in bases]
-            for n in orders:
-                if 0 < n <= min(len(start.s) for start in starts):
+            starts = [_predictor(base, p, max(orders)) for base in bases]
+            shown = min(len(start.s) for start in starts)
+            for n in orders if len(orders) > 1 else (min(orders[0], shown),):
+                if 0 < n <= shown:
                     pars[n, p] = [_states(start, n) for start in starts]
     if pars:
         rows = judged({key: [*map(steady, x)] for key, x in pars.items()})
@@ -520,8 +521,8 @@ class _Predictor(NamedTuple):
     first: Array
 
 
-def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
-    """Fit an ARX model of ``lags`` and decompose its predictions over the HORIZONS."""
+def _predictor(data: Sequence[Signals], lags: int, order: int) -> _Predictor:
+    """Fit an ARX model of ``lags``; decompose its predictions over HORIZONS, or ``order`` steps."""
     n_y = data[0].y.shape[1]
     windows, after = [], []
     for y, v in _runs(data):
@@ -535,7 +536,7 @@ def _predictor(data: Sequence[Signals], lags: int) -> _Predictor:
     q = Z.shape[1] // lags
     step, rows = np.eye(len(W) - 1, k=q), [W[:-1].T]
     step[-q : n_y - q or None] = W[:-1].T
-    for _ in range(max(HORIZONS) - 1):
+    for _ in range(max(*HORIZONS, order) - 1):
         rows.append(rows[-1] @ step)
     G = np.concatenate(rows)
     first = np.mean([y[0] for y, _ in _runs(data)], 0)
