@@ -69,6 +69,28 @@ def test_signals_go_in_and_out_by_name():
     assert u == {"valve": by_vector.step([0.5], [1.0])[0]}
 
 
+def test_a_series_is_by_name_in_any_order():
+    model = np.diag([0.9, 0.5]), np.eye(2)
+    mpc = qm.LinearMPC(model, 5, Q=1.0, dR=0.1, outputs=["T", "h"], inputs=["p", "q"])
+    signals = {"T": 1.0, "h": -2.0}, {"T": 0.5, "h": 3.0}, {"T": 0.1, "h": 2.0}
+    us = []
+    for y, r, noise in (signals, [pd.Series(x)[["h", "T"]] for x in signals]):
+        controller = qm.Controller(mpc, noise=noise)
+        us.append((controller.step(y, r), controller.step(r, y)))
+    assert us[0] == us[1]
+    y, r, _ = signals
+    with pytest.raises(QPError, match=r"^y: got signals \['a', 'b'\]"):
+        qm.Controller(mpc).step(pd.Series({"a": 1.0, "b": -2.0}), r)
+
+
+@pytest.mark.parametrize("r", [[None], {"y1": None}, [np.nan]])
+def test_a_set_point_that_is_none_is_invalid_as_nan_is(r):
+    controller = qm.Controller(integrator())
+    u = controller.step([0.0], [0.5])
+    assert (controller.step([0.0], r) == u).all()
+    assert controller.status.name == "INVALID"
+
+
 def test_a_reset_starts_where_the_plant_rests():
     controller = qm.Controller(integrator())
     controller.reset(y=[3.0], u=[0.2])

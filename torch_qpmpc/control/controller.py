@@ -20,7 +20,7 @@ from torch_qpmpc.control.linear_mpc import LinearMPC, packed, restored, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, ready, simulate
-from torch_qpmpc.control.state_space import Array, read_measured, read_table
+from torch_qpmpc.control.state_space import Array, by_name, read_table
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.files import load_file, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
@@ -182,7 +182,7 @@ class Controller:
         law, rows = self._law, self.mpc.horizon + 1
         ahead = law.read_known(known, rows, sane=False)
         set_points = law.read_set_points(r, rows, self._memory.r, sane=False)
-        measured = read_measured("y", y, law.design.plant.outputs)
+        measured = read_table("y", y, law.design.plant.outputs, 1, finite=False)[0]
         self._now = Signals(measured, set_points, ahead)
         move = law.step(self._memory, *self._now)
         self._law, self._memory, self.status = move.law, move.memory, move.status
@@ -190,7 +190,7 @@ class Controller:
         if move.target is not None and move.p is not None:
             self.p, *target = map(torch.from_numpy, (move.p, *move.target))
             self.target = Target(*target)
-        if isinstance(y, Mapping):
+        if isinstance(by_name(y), Mapping):
             return dict(zip(law.design.plant.inputs, move.u.tolist(), strict=True))
         return move.u.copy()
 
@@ -205,8 +205,8 @@ class Controller:
             QPError: a name or shape is wrong, or known signals are missing.
         """
         law, ahead = self._law, self._law.read_known(known, 1, sane=False)
-        applied = read_measured("u", u, law.design.plant.inputs)
-        measured = read_measured("y", y, law.design.plant.outputs)
+        applied = read_table("u", u, law.design.plant.inputs, 1, finite=False)[0]
+        measured = read_table("y", y, law.design.plant.outputs, 1, finite=False)[0]
         self._memory, self.status = law.observed(self._memory, measured, applied, ahead)
         self._now = None
 

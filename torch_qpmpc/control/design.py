@@ -611,7 +611,7 @@ def signals_of(bounds: Any) -> list[str]:
 
 def read_limits(
     name: str, bounds: Any, names: Sequence[str], plant: StateSpace
-) -> tuple[Any, dict[str, tuple[str, str]]]:
+) -> tuple[Any, dict[str, Any]]:
     """Split bounds into numbers and known signals; see `Design.limits`."""
     if not (signals := signals_of(bounds)):
         return bounds, {}
@@ -621,13 +621,10 @@ def read_limits(
             raise QPError.expected(name, repr(signal), "numbers or known signals", remedy)
         _check_apart(name, signal, plant)
     pairs = bounds if isinstance(bounds, Mapping) else dict.fromkeys(names, tuple(bounds))
-    numbers: dict[str, Any] = dict(pairs)
-    limits: dict[str, Any] = {}
-    for key, pair in pairs.items():
-        if signals_of({key: pair}):
-            numbers[key] = [None if isinstance(x, str) else x for x in pair]
-            limits[key] = tuple(x if isinstance(x, str) else "" for x in pair)
-    return numbers, limits
+    own = {key: pair for key, pair in pairs.items() if signals_of({key: pair})}
+    numbers = {key: [None if isinstance(x, str) else x for x in pair] for key, pair in own.items()}
+    limits = {k: tuple(x if isinstance(x, str) else "" for x in pair) for k, pair in own.items()}
+    return {**pairs, **numbers}, limits
 
 
 def read_constraints(name: str, value: Any, names: Sequence[str]) -> dict[str, Constraint]:

@@ -26,7 +26,7 @@ from torch_qpmpc.control.observer import (
     max_plausible,
     moving,
 )
-from torch_qpmpc.control.state_space import Array, read_table
+from torch_qpmpc.control.state_space import Array, by_name, read_table
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.mpc.nonlinear import SequentialQP
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
@@ -467,7 +467,7 @@ class Law:
         if r is None and not len(last) and self.design.Q.any():
             want = f"set-points of {', '.join(outputs)}"
             raise QPError.expected("r", "None in the first step", want)
-        r = (last if len(last) else np.zeros(len(outputs))) if r is None else r
+        r = (last if len(last) else np.zeros(len(outputs))) if r is None else by_name(r)
         unweighted = {*range(len(outputs))} - {*self.design.weighted}
         if isinstance(r, Mapping):
             r = {**dict.fromkeys([outputs[i] for i in unweighted], 0.0), **r}

@@ -214,19 +214,11 @@ def _check_absent(why: str, **arguments: Any) -> None:
             raise QPError.expected(name, repr(value), f"None, as {why}")
 
 
-def read_measured(name: str, value: Any, names: Sequence[str]) -> Array:
-    """Return one number for each name as `read_table`, NaN where it is None or all are.
-
-    Raises:
-        QPError: a name is missing or unknown, or the shape is wrong.
-    """
-    if value is None:
-        return np.full(len(names), np.nan)
-    if isinstance(value, Mapping):
-        value = {key: np.nan if x is None else x for key, x in value.items()}
-    elif isinstance(value, Sequence):
-        value = [np.nan if x is None else x for x in value]
-    return read_table(name, value, names, 1, finite=False)[0]
+def by_name(value: Any) -> Any:
+    """Return a pandas Series with names as a dictionary, and other values as they are."""
+    is_series = hasattr(value, "to_dict") and not hasattr(value, "columns")
+    named = is_series and all(isinstance(x, str) for x in value.index)
+    return value.to_dict() if named else value
 
 
 def read_table(
@@ -235,11 +227,13 @@ def read_table(
     """Return ``(rows, len(names))`` from a mapping or DataFrame of columns, or an array.
 
     One row stands for all; a table that ends early holds its last row, and a longer one is cut.
+    None, as a value or as a number, is missing: NaN.
 
     Raises:
         QPError: a name is missing or unknown, a number is not finite (unless ``finite`` is False),
             the shape is wrong, or more than one row and fewer than ``least``.
     """
+    value = [None] * len(names) if value is None else by_name(value)
     if hasattr(value, "columns"):  # a DataFrame
         value = {column: value[column].to_numpy() for column in value.columns if column in names}
     if isinstance(value, Mapping):
@@ -269,6 +263,7 @@ def read_table(
 
 def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> Array:
     """Read one number for each name, from a number, a vector or a mapping; None is missing."""
+    value = by_name(value)
     if isinstance(value, Mapping):
         if unknown := sorted({*value} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
@@ -282,7 +277,10 @@ def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> 
 
 
 def _numbers(name: str, value: Any) -> Array:
-    """Return `read_numbers` as an array, which floats and arrays of float64 are at once."""
+    """Return `read_numbers` as an array, NaN for None; floats and float64 are one at once."""
+    value = np.nan if value is None else value
+    if isinstance(value, list | tuple):
+        value = [np.nan if x is None else x for x in value]
     of_floats = isinstance(value, list) and all(type(x) is float for x in value)
     if of_floats or isinstance(value, float) or getattr(value, "dtype", None) == np.float64:
         return np.asarray(value)
