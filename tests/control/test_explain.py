@@ -154,6 +154,14 @@ def test_hard_bounds_without_a_plan_are_named():
     assert "holds T outside the hard bounds. Give T a finite y_slack." in str(made.explain())
 
 
+def test_inputs_whose_bounds_contradict_are_told_of_them_alone():
+    limited = {"known": ["most"], "u_bounds": {"u1": (2.0, "most")}}
+    made = qm.Controller(qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, dR=0.1, **limited))
+    made.step([0.0], [1.0], known=[1.0])
+    *_, last = str(made.explain()).splitlines()
+    assert last == "The plant rests with no input within its bounds. Widen u_bounds."
+
+
 def test_what_holds_a_free_input_is_said():
     for R, held in ((0.1, "at rest"), (None, "no R holds it")):
         mpc = qm.LinearMPC(([[0.9]], [[0.2, 0.1]]), 5, Q=1.0, R=R, dR=0.1, u_target={"u1": 0.5})

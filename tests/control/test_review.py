@@ -46,6 +46,11 @@ MISTAKES = {
         ("cost", r"Raise the weights of the inputs to R=(0\.01)\."),
         weighted,
     ),
+    "prices alone": (
+        (LAG, {"Q": None, "dR": None, "linear": {"u1": 0.3}}),
+        ("cost", r"Raise the weights of the inputs to R=(0\.0003)\."),
+        weighted,
+    ),
     "a set-point out of reach": (
         (LAG, {"r": [7.0]}),
         ("set-points", r"Set y1 to (4), not 7, or widen y_bounds of y1\."),
@@ -225,6 +230,14 @@ def test_outputs_reach_what_the_zones_of_others_leave():
         numbers = qm.Controller(mpc).review()["set-points"].numbers
         assert np.allclose(numbers["y1 reaches"], expected)
         assert np.allclose(numbers["y2 reaches"], [-2.5, 2.5])
+
+
+@pytest.mark.parametrize("least", [1.0, 2.0])
+def test_an_end_of_the_reach_that_rounding_leaves_of_zero_is_zero(least):
+    model = {"model": ([[0.95]], [[0.3]]), "E": [[0.1]], "u_bounds": (least, 12.0)}
+    mpc = qm.LinearMPC(horizon=5, Q=1.0, dR=0.1, **model)
+    finding = qm.Controller(mpc).review(r=[1.0], known=[-3.0 * least])["set-points"]
+    assert " reach y1 0 to " in finding.text
 
 
 COUPLED = (np.diag([0.9, 0.8]), np.array([[0.5, 0.1], [0.13, 0.47]]))

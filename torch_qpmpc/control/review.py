@@ -25,8 +25,8 @@ from torch_qpmpc.qp.pipeline.condensing import null_space
 MARGIN, HIDDEN = 0.3, 1e-3
 #: The most that a loop may cost under the log's noise, relative to a constant input.
 NOISY = 1.1
-#: Offsets of the loop, of set-points, and of outputs from their bounds while inputs are on levels,
-#: relative to half the distance of an output's bounds.
+#: Offsets of the loop and ends of the reach, of set-points, and of outputs from their bounds while
+#: inputs are on levels, relative to half the distance of an output's bounds.
 OFFSET, SEEN, OUTSIDE = 1e-6, 1e-3, 0.05
 #: A response below this share of those soon after, with inputs of half their range, is noise.
 SHOWS = 0.03
@@ -125,7 +125,8 @@ def _cost(mpc: LinearMPC) -> Finding:
     sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
     ok = bool(sizes[0] > SINGULAR * sizes[-1])
     text = f"The eigenvalues of the plan's cost are {sizes[0]:.3g} to {sizes[-1]:.3g}."
-    least = [f"{1e-3 * sizes[-1] / x**2:.1g}" for x in u]
+    most = sizes[-1] if sizes[-1] > SINGULAR * design.typical else design.typical  # of prices
+    least = [f"{1e-3 * most / x**2:.1g}" for x in u]
     named = ", ".join(f"{name!r}: {x}" for name, x in zip(design.plant.inputs, least, strict=True))
     weight = least[0] if len({*least}) == 1 else f"{{{named}}}"
     remedy = f"Raise the weights of the inputs to R={weight}."
@@ -335,7 +336,8 @@ def _reach(design: Design, w: Array, known: Array) -> Array:
                 break
         otherwise = np.nan if least.status == 2 else -np.inf
         ends[i, side] = sign * (least.fun if least.status == 0 else otherwise)
-    return ends * design.scaling.y[:, None] + (steady.y @ loads)[:, None]
+    ends = ends + (steady.y @ loads / design.scaling.y)[:, None]
+    return np.where(np.abs(ends) < OFFSET, 0.0, ends) * design.scaling.y[:, None]
 
 
 def _stability(loop: LinearLoop, gamma: float, of_terminal: str) -> Finding:
