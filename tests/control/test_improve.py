@@ -204,3 +204,9 @@ def test_improve_refuses(change):
     log = change.pop("log", None)
     log = logged() if log is None else qm.read_log(log, outputs=["y"], inputs=["u"])
     controller.improve(log, **change)
+
+
+def test_levels_are_refused_before_a_model_is_identified():
+    mpc = qm.LinearMPC(([[0.9]], [[0.5]]), 5, Q=1.0, u_levels={"u1": (0, 1)}, learn=("H",))
+    with pytest.raises(QPError, match=r"^mpc: got one with levels"):
+        qm.Controller(mpc).improve("no file is read")

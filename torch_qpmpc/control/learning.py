@@ -39,6 +39,7 @@ from torch_qpmpc.learning.closed_loop import MEMBERS, Improvement, SimulatedPlan
 from torch_qpmpc.learning.closed_loop import improve as descend
 from torch_qpmpc.learning.gate import FEWEST, PairedTest
 from torch_qpmpc.mpc.module import QPMPC
+from torch_qpmpc.mpc.validation import check_no_levels
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
@@ -267,6 +268,7 @@ def improve(
 ) -> tuple[Improvement, Law]:
     """Return the report and the law with the new theta; see `Controller.improve`."""
     law.design.plant.check_linear("improve")
+    check_no_levels(law.mpc.plan, "gradients of closed loops")
     members, seed = options.pop("members", MEMBERS), options.get("seed", 0)
     check_whole("members", members, 1)
     check_seed(seed)
