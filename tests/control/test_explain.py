@@ -162,6 +162,12 @@ def test_inputs_whose_bounds_contradict_are_told_of_them_alone():
     assert last == "The plant rests with no input within its bounds. Widen u_bounds."
 
 
+def test_a_plan_of_one_stage_ends_in_one_step():
+    made = qm.Controller(qm.LinearMPC(([[0.9]], [[0.5]]), 1, Q=1.0, dR=0.1))
+    made.step([0.0], [1.0])
+    assert ", set-point 1, in 1 step " in str(made.explain())
+
+
 def test_what_holds_a_free_input_is_said():
     for R, held in ((0.1, "at rest"), (None, "no R holds it")):
         mpc = qm.LinearMPC(([[0.9]], [[0.2, 0.1]]), 5, Q=1.0, R=R, dR=0.1, u_target={"u1": 0.5})

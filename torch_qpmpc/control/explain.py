@@ -58,7 +58,8 @@ class Explanation:
         plant, lines = self.design.plant, [f"{self.status}: {self.status.explanation}"]
         for i, name in enumerate(plant.outputs):
             aim = f", set-point {self.now.r[0, i]:.4g}" * bool(self.design.Q[i].any())
-            later = f", in {len(self.y)} steps {self.y[-1, i]:.4g}"
+            steps = f"{len(self.y)} step{'s' * (len(self.y) > 1)}"
+            later = f", in {steps} {self.y[-1, i]:.4g}"
             later *= bool(np.isfinite(self.y[-1, i]))
             lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
         for i, name in enumerate(plant.inputs):
