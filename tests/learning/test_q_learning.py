@@ -275,6 +275,15 @@ def test_a_centred_batch_has_a_mean_error_of_zero(estimator, delay_value):
     assert (td == before).all(), "the batch is left alone"
 
 
+@pytest.mark.parametrize("delay_value", [False, True])
+@pytest.mark.parametrize("way", [copy.deepcopy, lambda loss: loss.float()], ids=["copy", "cast"])
+def test_a_copied_or_cast_loss_is_centred(way, delay_value):
+    loss = way(make_loss(operator=make_operator(learn=("C",)), delay_value=delay_value))
+    td = make_batch(6, 5)
+    assert abs(loss.centre_(td)) > 0.1
+    assert abs(loss.centre_(td)) < 1e-5
+
+
 def test_c_stays_without_a_usable_transition_or_a_discount():
     loss, td = make_loss("tdlambda", make_operator()), make_batch(7, 9)
     td["next", "terminated"] = torch.zeros(7, 9, 1).bool()

@@ -447,8 +447,8 @@ def test_frozen_parameters_stay_frozen():
 # Copies, pickles and checkpoints
 
 
-def pickled(mpc: QPMPC) -> QPMPC:
-    return pickle.loads(pickle.dumps(mpc))
+def pickled(content: Any) -> Any:
+    return pickle.loads(pickle.dumps(content))
 
 
 def without_values(mpc: QPMPC) -> QPMPC:
@@ -510,6 +510,18 @@ def test_a_copy_keeps_mode_dtype_and_what_is_frozen(copied, learn):
     assert_close(twin.value(s), mpc.value(s), rtol=0, atol=0)
     assert_close(mpc.value(s), expected, rtol=1e-4, atol=1e-4)
     assert repr(twin) == repr(mpc)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickled])
+@pytest.mark.parametrize("learn", [("H", "C"), ("C",)])
+def test_an_optimiser_copied_with_its_qp_moves_the_copy(copied, learn):
+    mpc, s = random_mpc(12, learn=learn), random_states(4)
+    twin, optimizer = copied((mpc, torch.optim.SGD(mpc.parameters(), lr=0.01)))
+    before = twin.value(s)
+    before.sum().backward()
+    optimizer.step()
+    assert (twin.value(s) - before).abs().max() > 1e-6
+    assert_close(mpc.value(s), before)
 
 
 # An H that is indefinite on what is known

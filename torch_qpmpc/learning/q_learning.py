@@ -335,12 +335,11 @@ class QPQLearningLoss(LossModule):
         # Where gamma is 1, rounding is left.
         if not lost > 1e-6 * use.sum():
             return 0.0
-        shift, c = float((prediction - target)[use].sum() / lost), self.operator.module.c
-        if self.delay_value:
-            online, delayed = self.value_network_params, self.target_value_network_params
-            key = next(k for k, x in online.items(True, True) if x.data_ptr() == c.data_ptr())
-            delayed.get(key).add_(shift)
-        c += shift
+        shift = float((prediction - target)[use].sum() / lost)
+        networks = self.value_network_params, self.target_value_network_params
+        for params in networks[: 1 + self.delay_value]:
+            with params.to_module(self.value_network, preserve_module_state=False):
+                self.operator.module.c.add_(shift)
         return shift
 
     def _bounded(self, value: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.utils import parametrize
 
 from torch_qpmpc.errors import QPError
@@ -95,15 +95,15 @@ def reduce(mpc: Any) -> tuple:
         check_own("pickle", mpc)
     plain = parametrize.type_before_parametrizations(mpc)
     frozen = [name for name, part in mpc.named_parameters() if not part.requires_grad]
-    # The scheme identifies the state; a child process cannot share the tensor of _extra_state.
-    state = {name: x for name, x in mpc.state_dict().items() if name != "_extra_state"}
+    # The parameters themselves, which an optimiser in the same pickle has, too. The scheme
+    # identifies the state; a child process cannot share the tensor of _extra_state.
+    state = {x: y for x, y in mpc.state_dict(keep_vars=True).items() if x != "_extra_state"}
     return _rebuild, (plain, mpc.scheme, mpc._options(), state, frozen, mpc.training)
 
 
-def _rebuild(cls: type[nn.Module], scheme: Scheme, *content: Any) -> nn.Module:
-    options, state, frozen, training = content
+def _rebuild(cls: Any, scheme: Scheme, options: Any, state: Any, frozen: Any, mode: bool) -> Any:
     module = cls(scheme, **options)
     module.load_state_dict(state, assign=True)
     for name in frozen:
         module.get_parameter(name).requires_grad_(False)
-    return module.train(training)
+    return module.train(mode)
