@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.func import vmap
 from torch.nn.utils import parametrize
 from torch.testing import assert_close
+from torch.utils.checkpoint import checkpoint
 
 from tests.problems import MIXED, random_mpc, random_states, step
 from torch_qpmpc import QPMPC, QPError
@@ -144,6 +145,16 @@ def test_no_gradient_is_recorded_where_none_is_needed():
     assert not mpc.value(S).requires_grad
     assert not mpc.policy(S).requires_grad
     assert mpc.value(S.clone().requires_grad_()).requires_grad
+
+
+@pytest.mark.parametrize("output", ["value", "policy"])
+def test_checkpointing_gives_the_same_gradient(output):
+    """PyTorch's checkpoints let a backward read what it saved only once."""
+    mpc, s = random_mpc(0), S.clone().requires_grad_()
+    function = getattr(mpc, output)
+    expected = torch.autograd.grad(function(s).sum(), (s, mpc.C))
+    found = torch.autograd.grad(checkpoint(function, s, use_reentrant=False).sum(), (s, mpc.C))
+    assert_close(found, expected, rtol=0, atol=0)
 
 
 def test_strided_expanded_and_empty_inputs():

@@ -205,9 +205,9 @@ def _setup_context(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
 
 
 def _backward(ctx: Any, *incoming: Tensor | None) -> tuple:
-    theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
-    needed = ctx.needs_input_grad[:N_THETA]
-    grads = gradients(incoming[:5], theta, solution, needed, ctx.n_kept)
+    # Read once: checkpointing forbids a second time, and other hooks repeat their work.
+    saved, needed = ctx.saved_tensors, ctx.needs_input_grad[:N_THETA]
+    grads = gradients(incoming[:5], saved[:N_THETA], saved[N_THETA:], needed, ctx.n_kept)
     return (*grads, *(None,) * N_OTHERS)
 
 
@@ -254,8 +254,8 @@ class TracedForward(Traced):
 
     @staticmethod
     def jvp(ctx: Any, *d_inputs: Tensor | None) -> tuple:
-        theta, solution = ctx.saved_tensors[:N_THETA], ctx.saved_tensors[N_THETA:]
-        d_outputs = tangents(d_inputs[:N_THETA], theta, solution, ctx.n_kept)
+        saved = ctx.saved_tensors
+        d_outputs = tangents(d_inputs[:N_THETA], saved[:N_THETA], saved[N_THETA:], ctx.n_kept)
         return *d_outputs, *(None,) * 5
 
     @staticmethod
