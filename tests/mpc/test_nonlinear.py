@@ -188,6 +188,13 @@ def test_gradients_equal_finite_differences(case, place):
         assert_close(own, other, rtol=1e-4, atol=1e-4, msg=lambda m, n=name: f"{n}: {m}")
 
 
+def test_an_action_value_of_horizon_one_has_gradients():
+    """No action is left to plan."""
+    mpc = QPMPC.of(2, 1, 1, dynamics=Pendulum(), stage_weight=[1.0, 0.1, 0.1], solver="daqp")
+    s, a = states(mpc).requires_grad_(), torch.full((4, 1), 0.1).double().requires_grad_()
+    assert torch.autograd.gradcheck(mpc.action_value, (s, a), eps=1e-5, atol=1e-4)
+
+
 def test_a_saddle_says_that_the_plan_has_no_gradient():
     def hilltop(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         return x + 0.1 * u, 1e6 * x[..., 0] ** 4 - x[..., 0] ** 2

@@ -482,4 +482,4 @@ def _strict(qp: QuadraticProgram, fixed: Tensor, lam: Tensor) -> Tensor:
     rows = torch.where(held.unsqueeze(-1), F.normalize(G, dim=-1), 0)
     kept = torch.linalg.pinv(rows) @ rows
     free = torch.eye(H.shape[-1]).to(H) - kept
-    return torch.linalg.eigvalsh(free @ H @ free + kept)[:, 0] > DEFINITE
+    return (torch.linalg.eigvalsh(free @ H @ free + kept) > DEFINITE).all(-1)
