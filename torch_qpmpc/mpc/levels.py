@@ -114,7 +114,7 @@ class Levels:
         """
         theta = (*qp.tensors(), fixed)
         if not is_eager(theta):
-            want = "a call outside torch.compile and torch.func, as a search depends on values"
+            want = "one outside torch.compile, torch.func and losses without deactivate_vmap=True"
             raise QPError.expected("action_levels", "a traced call", want)
         with torch.no_grad():
             programs, batch = Programs.of(*(x.detach().cpu() for x in theta), n_kept=n_kept)

@@ -267,7 +267,7 @@ class SequentialQP(nn.Module):
         not, or that of a `PlanSolution`. With NaN, or what is no plan, the search starts cold.
         """
         if not is_eager(theta := (*qp.tensors(), fixed)):
-            want = "a call outside torch.compile and torch.func, as a search depends on values"
+            want = "one outside torch.compile, torch.func and losses without deactivate_vmap=True"
             raise QPError.expected("dynamics", "a traced call", want)
         N, n_u, batch = self.layout.horizon, self.layout.n_u, fixed.shape[:-1]
         batch = torch.broadcast_shapes(qp.batch_shape, batch)
