@@ -27,17 +27,17 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 417,
+    ".": 416,
     "analysis": 851,
     "control": 4824,  # nonlinear plants
     "envs": 1410,
     "experiment": 2839,
     "export": 1474,
-    "learning": 2831,  # models that did not train theta decide in improve
-    "identification": 2632,
-    "mpc": 3836,
+    "learning": 2830,  # models that did not train theta decide in improve
+    "identification": 2650,
+    "mpc": 3844,
     "proofs": 1001,
-    "qp": 5291,  # caches that notice a called kernel, which the levels pay for
+    "qp": 5296,  # caches that notice a called kernel, which the levels pay for
     "study": 585,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.
