@@ -33,7 +33,7 @@ BUDGET = {
     "envs": 1410,
     "experiment": 2839,
     "export": 1474,
-    "learning": 2830,  # models that did not train theta decide in improve
+    "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2650,
     "mpc": 3844,
     "proofs": 1001,

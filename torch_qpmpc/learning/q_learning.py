@@ -34,8 +34,9 @@ class QPQLearningLoss(LossModule):
     V and Q are the same QP without and with u_0 fixed, so V(s+) is exactly min over a of Q(s+, a).
     Truncation bootstraps, termination does not.
 
-    Batches of n-step transitions (TorchRL's ``steps_to_next_obs``) and, with the TD(lambda)
-    estimator, of slices ``(*batch, n)`` have returns of several steps.
+    Batches of n-step transitions (TorchRL's ``steps_to_next_obs``; set its ``done_keys`` to
+    ``["done"]``, or ``terminated`` stays the first step's) and, with the TD(lambda) estimator, of
+    slices ``(*batch, n)`` have returns of several steps.
 
     If `observe` sees all transitions, V(s+) is clipped to the values of paying the smallest and the
     largest cost so far, or zero, for ever (Munos and Szepesvari, "Finite-time bounds for fitted
