@@ -166,13 +166,13 @@ def slope_along(function: Any, point: list[Tensor], change: list[Tensor]) -> Ten
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: ", ".join(case) or "plain")
-@pytest.mark.parametrize("place", ["random", "origin", "at bounds"])
-def test_gradients_equal_finite_differences(case, place):
+def test_gradients_equal_finite_differences(case):
+    """At the origin, near it, and where bounds are active."""
     mpc = made(**case)
-    s = states(mpc, 3, {"random": 0.3, "origin": 0.0, "at bounds": 0.9}[place], seed=4)
+    s = torch.cat([states(mpc, 3, size, seed=4) for size in (0.3, 0.0, 0.9)])
     if case.get("state_slack") == torch.inf:
         s *= 0.5  # from which the bounds can be kept
-    a = torch.tensor([[0.2], [-0.7], [1.0]]).double()
+    a = torch.tensor([[0.2], [-0.7], [1.0]]).double().repeat(3, 1)
     functions = {
         "V": lambda: mpc.value(s),
         "Q": lambda: mpc.action_value(s, a),
