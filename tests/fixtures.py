@@ -27,7 +27,7 @@ from tests.runs import SMALL, make_config
 from torch_qpmpc.control import exporting
 from torch_qpmpc.experiment.tasks import identified
 from torch_qpmpc.export import comparison, library
-from torch_qpmpc.identification import identification, subspace
+from torch_qpmpc.identification import identification, learned, subspace
 from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.learning import closed_loop
 from torch_qpmpc.mpc import stage_cost
@@ -121,7 +121,8 @@ def quick_identifications() -> Iterator[None]:
 
 @pytest.fixture
 def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fit models and costs roughly: the tests of mpc compare the fits."""
+    """Fit models, networks and costs roughly: the tests of mpc compare the fits."""
+    monkeypatch.setattr(learned, "STEPS", 400)
     monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4))
     monkeypatch.setattr(subspace, "LAGS", (2, 10))
     monkeypatch.setattr(subspace, "MANY", 8)

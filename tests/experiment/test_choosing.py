@@ -31,7 +31,6 @@ from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
 from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
-from torch_qpmpc.identification import learned
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.riccati import terminal_riccati
 from torch_qpmpc.study.runs import FinishedRun
@@ -81,7 +80,6 @@ def _plant(monkeypatch, register, known_starts):
 
     register(Lag, name="Lag-v0")
     monkeypatch.setattr(choosing, "candidates", once)
-    monkeypatch.setattr(learned, "STEPS", 400)
 
 
 def chosen(*overrides):
@@ -252,6 +250,7 @@ def periodic(register):
 def test_a_run_starts_from_networks_learns_the_cost_and_resumes(tmp_path, monkeypatch, capsys):
     """It says that C and b are not learned; nor is C's deviation penalised."""
     settings = ("optimizer=gauss_newton", "batch_size=64", "gate=true", "eval_interval=2")
+    settings += ("task.eval_steps=7",)
     cfg, cut = make_config(*DATA, *settings, "constraint=deviation"), tmp_path / "cut"
     run = trained(cfg, tmp_path / "whole")
     assert run.summary["start"] == NONLINEAR

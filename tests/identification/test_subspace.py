@@ -122,7 +122,7 @@ def test_a_simulation_may_start_anywhere_in_the_range_of_the_log(pieces):
 
 @pytest.mark.parametrize("kind", ["a fifth", "every third row"])
 def test_missing_outputs_cost_only_their_information(kind):
-    log, new = tank(900, 40, 11), tank(300, 45, 12)
+    log, new = tank(400, 40, 11), tank(300, 45, 12)
     y, rng = log["y"].copy(), np.random.default_rng(13)
     gone = rng.random(len(y)) < 0.2 if kind == "a fifth" else np.arange(len(y)) % 3 > 0
     y[gone] = np.nan
