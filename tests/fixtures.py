@@ -122,7 +122,7 @@ def quick_identifications() -> Iterator[None]:
 @pytest.fixture
 def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit models, networks and costs roughly: the tests of mpc compare the fits."""
-    monkeypatch.setattr(learned, "STEPS", 400)
+    monkeypatch.setattr(learned, "STEPS", 200)
     monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4))
     monkeypatch.setattr(subspace, "LAGS", (2, 10))
     monkeypatch.setattr(subspace, "MANY", 8)
