@@ -13,7 +13,6 @@ import torch_qpmpc
 from tests.pages import DOCS, PAGES, ROOT, fenced, needs_docs
 from tests.runs import SMALL, ended
 from torch_qpmpc.experiment.tasks import TASKS
-from torch_qpmpc.identification import learned
 from torch_qpmpc.proofs import invariant
 from torch_qpmpc.qp import solvers
 
@@ -29,6 +28,7 @@ EXAMPLES = sorted(
 SLOW = [f"docs/guides/{x}.md" for x in ("torchrl", "environment", "prove", "closed-loops")]
 
 
+@pytest.mark.usefixtures("rough_fits")
 @pytest.mark.parametrize(
     "page",
     [
@@ -43,7 +43,6 @@ def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.delitem(TASKS, "pole", raising=False)  # and again afterwards
     monkeypatch.setattr(solvers, "BACKENDS", dict(solvers.BACKENDS))
     monkeypatch.setattr(invariant, "GAINS", (1.0,))  # saturated laws take longer
-    monkeypatch.setattr(learned, "STEPS", 500)
     namespace: dict[str, object] = {"__name__": "page"}
     for line, code in fenced(PAGES[page], "python"):
         # Blank lines first, so that a traceback names the page's own line.

@@ -14,7 +14,6 @@ import torch_qpmpc.control.law
 from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.state_space import read_model
-from torch_qpmpc.identification import learned
 from torch_qpmpc.identification.learned import LearnedModel
 
 NAMES: Any = {"inputs": ["hot", "cold"], "outputs": ["level", "T"]}
@@ -168,8 +167,8 @@ def log() -> dict[str, np.ndarray]:
     return {"y": np.array(y)[:, None], "u": np.array(u[:-1])[:, None]}
 
 
-def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path, monkeypatch):
-    monkeypatch.setattr(learned, "STEPS", 300)
+@pytest.mark.usefixtures("rough_fits")
+def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path):
     model = qm.identify_nonlinear(qm.identify(log, order=3))
     assert model.depth
     options: Any = {"Q": 1.0, "dR": 0.1, "u_bounds": (0.0, 2.0), "disturbances": {"y": "u"}}
