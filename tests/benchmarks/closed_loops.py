@@ -11,22 +11,21 @@ table goes into docs/results/improvement.md. ``--time`` measures a hundred gradi
 """
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import pandas as pd
 import torch
 
 import torch_qpmpc as qm
 from tests.benchmarks import outside
 from tests.benchmarks.improvement import SHORT_EPISODES
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, keep, options_of
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -208,23 +207,14 @@ def timed() -> float:
 
 def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.closed_loops")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--cases", nargs="+", choices=CASES, default=[*CASES])
     parser.add_argument("--time", action="store_true", help="measure a hundred gradients")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
-    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the table")
-    options = parser.parse_args(None if arguments is None else list(arguments))
+    options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     if options.time:
         print(f"{timed():.0f} s")
         return
-    rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
-    done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
-    for key in ((name, seed) for name in options.cases for seed in options.seeds):
-        if key not in done:
-            rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
-            rows.to_csv(options.results, index=False, float_format="%.6g")
-            print(*row.values(), flush=True)
+    rows = keep(options.results, itertools.product(options.cases, options.seeds), run)
     write_section(options.page, shown(rows), "closed-loops")
 
 

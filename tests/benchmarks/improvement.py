@@ -10,15 +10,13 @@ import argparse
 import functools
 import tempfile
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import torch
 
 import train
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, keep, options_of
 from tests.runs import make_config
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import cost_text
@@ -134,19 +132,11 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.improvement", description="Write the table of learning."
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--cases", nargs="+", choices=CASES, default=[*CASES])
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
-    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
-    options = parser.parse_args(None if arguments is None else list(arguments))
+    options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
-    rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
-    done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
-    for key in ((case, seed) for seed in options.seeds for case in options.cases):
-        if key not in done:
-            rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
-            rows.to_csv(options.results, index=False, float_format="%.6g")
-            print(*row.values(), flush=True)
+    keys = ((case, seed) for seed in options.seeds for case in options.cases)
+    rows = keep(options.results, keys, run)
     write_section(options.page, comparison(rows), "improvement")
 
 

@@ -40,7 +40,7 @@ from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 from tests.benchmarks import outside
 from tests.benchmarks.plants import CONVERSE, Converse, pendulum, swing
-from tests.benchmarks.table import DOCS, significant
+from tests.benchmarks.table import DOCS, options_of, significant
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import NONLINEAR, candidates
@@ -361,10 +361,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--plants", nargs="*", default=[*PLANTS, *CONVERSE])
     parser.add_argument("--rows", nargs="*", default=kinds, choices=kinds)
     parser.add_argument("--count", type=int, default=20_000, help="transitions of TD3 and SAC")
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
-    parser.add_argument("--page", type=Path, default=outside.PAGE, help="the file of the tables")
-    options = parser.parse_args(None if arguments is None else list(arguments))
+    options = options_of(parser, arguments, SEEDS, RESULTS, outside.PAGE)
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")  # rows have what they say
     for seed, plant in itertools.product(options.seeds, options.plants):

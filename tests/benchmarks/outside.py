@@ -36,7 +36,7 @@ import torch
 from scipy.optimize import linprog
 
 from tests.benchmarks import plants
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, options_of
 from tests.runs import compose_config
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import LINEAR
@@ -431,11 +431,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.outside", description="Write the table of other plants."
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--plants", nargs="+", default=[""], help="parts of the plants' names")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
-    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
-    options = parser.parse_args(None if arguments is None else list(arguments))
+    options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)  # rows have what they say
     for seed in options.seeds:

@@ -41,7 +41,7 @@ from torch import Tensor
 
 import torch_qpmpc as qm
 import train
-from tests.benchmarks.table import DOCS
+from tests.benchmarks.table import DOCS, options_of
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
@@ -504,11 +504,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.rivals")
     parser.add_argument("--plants", nargs="+", choices=PLANTS, default=[*PLANTS])
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
     parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=SHOWN)
-    parser.add_argument("--results", type=Path, default=RESULTS, help="the file of all rows")
-    parser.add_argument("--page", type=Path, default=PAGE, help="the file that gets the tables")
-    options = parser.parse_args(None if arguments is None else list(arguments))
+    options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
     for seed, plant, size in product(options.seeds, options.plants, options.sizes):

@@ -1,11 +1,16 @@
 """What the benchmarks' tables share."""
 
+import argparse
 import math
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
+
+import pandas as pd
 
 from torch_qpmpc.study.markdown import table, write_section
 
-__all__ = ["DOCS", "PAGE", "ROOT", "significant", "table", "write_section"]
+__all__ = ["DOCS", "PAGE", "ROOT", "keep", "options_of", "significant", "table", "write_section"]
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -17,3 +22,31 @@ def significant(x: float) -> str:
     if x >= 100:
         return f"{int(float(f'{x:.3g}')):,}"
     return f"{x:.{max(0, 2 - math.floor(math.log10(x)))}f}"
+
+
+def options_of(
+    parser: argparse.ArgumentParser,
+    arguments: Iterable[str] | None,
+    seeds: Iterable[int],
+    results: Path,
+    page: Path,
+) -> Any:
+    """Parse ``arguments`` of a program that keeps the rows of each seed in a file."""
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(seeds))
+    parser.add_argument("--results", type=Path, default=results, help="the file of all rows")
+    parser.add_argument("--page", type=Path, default=page, help="the file that gets the tables")
+    return parser.parse_args(None if arguments is None else list(arguments))
+
+
+def keep(
+    path: Path, keys: Iterable[tuple[str, int]], run: Callable[[str, int], dict[str, Any]]
+) -> Any:
+    """Return the rows of a file by case and seed, with those that it lacks, each kept at once."""
+    rows: Any = pd.read_csv(path) if path.exists() else pd.DataFrame()
+    done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
+    for key in keys:
+        if key not in done:
+            rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
+            rows.to_csv(path, index=False, float_format="%.6g")
+            print(*row.values(), flush=True)
+    return rows
