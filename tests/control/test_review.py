@@ -206,6 +206,7 @@ def test_findings_are_about_the_last_known_signals_or_those_passed():
     assert controller.review()["set-points"].text.startswith("At rain 0 (assumed) the outputs")
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_a_log_s_means_are_assumed_and_offsets_below_its_noise_are_no_fault():
     rng, y = np.random.default_rng(0), np.zeros(400)
     u, d = rng.uniform(0, 4, (2, 400))

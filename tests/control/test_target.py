@@ -52,6 +52,7 @@ def test_inputs_that_the_set_point_leaves_free_are_near_their_target(seed):
         assert np.abs(target.u.numpy() - u).max() < 1e-5
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_free_inputs_rest_near_the_log_s_mean_unless_told():
     rng, T = np.random.default_rng(0), np.full(400, 20.0)
     q = rng.uniform(2, 6, (20, 2)).repeat(20, 0)

@@ -125,6 +125,7 @@ def test_an_exact_log_is_not_said_to_be_late():
     assert "up a row" not in str(qm.identify({"y": y, "u": u}, N))
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_errors_are_those_of_data_that_the_fit_has_not_seen():
     found = qm.identify(lag_log(noise=0.2, steps=400), N)
     assert found.errors.shape[1:] == (N, 2)
