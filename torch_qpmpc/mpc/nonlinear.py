@@ -178,10 +178,10 @@ class SequentialQP(nn.Module):
         self.register_buffer("held", held, persistent=False)
 
     def stage(
-        self, d: Tensor, x: Tensor, u: Tensor, dynamics: Callable[..., Any] | None = None
+        self, d: Tensor, x: Tensor, u: Tensor, *, f: Callable[..., Any] | None = None
     ) -> tuple[Tensor, Tensor | None]:
-        """Return the next x, and the stage cost if there is one."""
-        f = dynamics or self.dynamics
+        """Return the next x, and the stage cost if there is one, of the dynamics or an equal f."""
+        f = f or self.dynamics
         out = f(x, u, d) if self.layout.n_d else f(x, u)
         return out if isinstance(out, tuple) else (out, None)
 
@@ -198,7 +198,7 @@ class SequentialQP(nn.Module):
         x, costs, states = p[..., layout.n_preview :], [], []
         f = self.dynamics.folded() if isinstance(self.dynamics, LearnedModel) else self.dynamics
         for d_k, u_k in zip(d[:-1], u.unbind(-2), strict=True):
-            x, cost = self.stage(d_k, x, u_k, f)
+            x, cost = self.stage(d_k, x, u_k, f=f)
             states.append(x.to(u))
             costs += [] if cost is None else [cost.to(u)]
         z = torch.cat((p, torch.cat((u, torch.stack(states, -2)), -1).flatten(-2)), -1)

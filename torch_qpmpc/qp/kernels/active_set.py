@@ -31,7 +31,7 @@ DEPENDENT, NOISE = 1e-11, 1e-9
 FEASIBLE = 1e-8
 #: Proximal steps, of a singular H; and slopes of the Lagrangian that one more pass reduces to this
 #: fraction of the linear cost, if H is ill-conditioned.
-PROXIMAL_STEPS, EXACT = 4, 1e-14
+PROXIMAL_STEPS, EXACT = 4, 1e-13
 #: The most changes of the active set; and the QPs before, one of which is similar.
 MAX_STEPS, NEAR = 2000, 256
 
