@@ -39,6 +39,7 @@ def main(updates: int = 1500, seed: int = 1, id: str | None = None) -> tuple[flo
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.95))
 
     frames = {"frames_per_batch": 16, "total_frames": 16 * updates}
+    frames["auto_register_policy_transforms"] = False  # the policy needs none
     collector = Collector(env, actor, **frames)
     replay = ReplayBuffer(storage=LazyTensorStorage(16_000), batch_size=64)
     for batch in collector:

@@ -32,6 +32,7 @@ def main(updates: int = 1500, seed: int = 1, id: str | None = None) -> tuple[flo
     size = 0.15 * (high - low).mean().item()
     noise = AdditiveGaussianModule(env.action_spec, sigma_init=size, sigma_end=size)
     frames = {"frames_per_batch": 16, "total_frames": 16 * updates}
+    frames["auto_register_policy_transforms"] = False  # the policy needs none
     collector = Collector(env, TensorDictSequential(actor, noise), **frames)
     replay = ReplayBuffer(storage=LazyTensorStorage(16_000), batch_size=64)
     for update, batch in enumerate(collector):
