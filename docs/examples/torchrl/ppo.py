@@ -31,7 +31,9 @@ def main(updates: int = 30, seed: int = 1, id: str | None = None) -> tuple[float
     groups += mpc.parameter_groups({"cost": 2e-2, "constraints": 2e-3})
     optimizer = torch.optim.Adam([*groups, {"params": scale.parameters(), "lr": 1e-2}])
 
-    collector = Collector(env, actor, frames_per_batch=800, total_frames=800 * updates)
+    frames = {"frames_per_batch": 800, "total_frames": 800 * updates}
+    frames["auto_register_policy_transforms"] = False  # the policy needs none
+    collector = Collector(env, actor, **frames)
     for batch in collector:
         for _ in range(4):
             advantage(batch)
