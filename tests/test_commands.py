@@ -72,6 +72,7 @@ MY_TASK = (("my_task.py", "register("),)
 SHORT = {
     # train.py: one run.
     "python train.py": Short(FEW, quick=True),
+    "python train.py --help": Short(),
     "python train.py solver=daqp": Short(FEW),
     "python train.py constraint=free noise=brownian seed=2": Short(FEW, quick=True),
     "python train.py constraint=deviation": Short(FEW),
@@ -207,7 +208,7 @@ def test_modules_that_commands_run_exist():
 @pytest.mark.parametrize("command", [x for x in EVERY if re.match("python train(?!.*my_task)", x)])
 def test_train_commands_have_possible_settings(command, monkeypatch):
     monkeypatch.chdir(ROOT)  # of the paths of examples
-    overrides = [word for word in shlex.split(command)[2:] if word != "-m"]
+    overrides = [word for word in shlex.split(command)[2:] if word not in {"-m", "--help"}]
     # Of a sweep, the first of each choice.
     first = [re.sub(r"=(?:range\()?([\w.]+),[^\[\]]*$", r"=\1", word) for word in overrides]
     make_config(*named_task(first))
