@@ -156,6 +156,26 @@ def test_estimates_and_plans_survive_what_overflows():
     assert own.status == 0
 
 
+def reacting(x: Tensor, u: Tensor) -> Tensor:
+    """Return the slopes of a cooled reactor, which has a second state at rest for these inputs."""
+    c, T = x.unbind(-1)
+    burnt = 7.2e10 * torch.exp(-8750.0 / T) * c
+    return torch.stack((1 - c - burnt, 350 - T + 209.2 * burnt + 2.092 * (u[..., 0] - T)), -1)
+
+
+@pytest.mark.parametrize("u", [[280.0], [300.0]])
+def test_a_start_is_near_rest_where_newtons_method_diverges(u):
+    f, x = qm.RungeKutta(reacting, 0.05), torch.tensor([0.5, 350.0])
+    model = f, x.numpy(), [300.0], [[0.0, 1.0]]
+    own = qm.Controller(qm.LinearMPC(model, 10, Q=1.0, dR=0.1, u_bounds=(280, 370)), noise=0.1)
+    own.reset(y=[350.0], u=u)
+    for _ in range(30):
+        x = f(x, torch.from_numpy(own.step(x.numpy()[1:], r=[345.0])))
+        assert own.status == 0
+    assert_allclose(x[1], 345.0, atol=0.05)
+    assert_allclose(own.x, x, rtol=0.02)  # not the other state at rest
+
+
 @pytest.fixture(scope="module")
 def log() -> dict[str, np.ndarray]:
     """A log of a tank behind a valve whose flow is a square root: the second state is hidden."""

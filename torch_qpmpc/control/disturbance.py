@@ -114,14 +114,9 @@ def check_observable(plant: StateSpace) -> None:
 
 def unseen_modes(A: Array, C: Array) -> list[tuple[complex, Array]]:
     """Return eigenvalues of A that do not decay, with their modes, that y = C x does not show."""
-    modes = []
-    for eigenvalue in np.linalg.eigvals(A):
-        if abs(eigenvalue) < 1 - 1e-9:
-            continue
-        mode = null_direction(A - eigenvalue * np.eye(len(A)), C)
-        if mode is not None:
-            modes.append((complex(eigenvalue), mode))
-    return modes
+    values = [x for x in np.linalg.eigvals(A) if abs(x) >= 1 - 1e-9]
+    pairs = [(complex(x), null_direction(A - x * np.eye(len(A)), C)) for x in values]
+    return [(x, mode) for x, mode in pairs if mode is not None]
 
 
 def null_direction(balance: Array, *shown: Array) -> Array | None:

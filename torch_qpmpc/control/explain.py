@@ -59,8 +59,7 @@ class Explanation:
         for i, name in enumerate(plant.outputs):
             aim = f", set-point {self.now.r[0, i]:.4g}" * bool(self.design.Q[i].any())
             steps = f"{len(self.y)} step{'s' * (len(self.y) > 1)}"
-            later = f", in {steps} {self.y[-1, i]:.4g}"
-            later *= bool(np.isfinite(self.y[-1, i]))
+            later = f", in {steps} {self.y[-1, i]:.4g}" * bool(np.isfinite(self.y[-1, i]))
             lines.append(f"{plant.quantity(name, self.now.y[i])}{aim}{later}")
         for i, name in enumerate(plant.inputs):
             held = "at rest" if self.design.R[i].any() else "no R holds it"

@@ -260,10 +260,9 @@ class Law:
             x, u = (np.atleast_2d(part)[-1] for part in target[:2])
             _, of_u, of_x, of_d = law.design.scaling
             off = np.concatenate((known[-1], x, u + self.loads @ w)) - law.design.plant.point
-            before, far = law, np.abs(off) > NEAR * np.concatenate((of_d, of_x, of_u))
-            law = law.at(np.append(x, w), u, known[-1], aims=True) if far.any() else law
-            if law is before:
+            if (np.abs(off) <= NEAR * np.concatenate((of_d, of_x, of_u))).all():
                 break
+            law = law.at(np.append(x, w), u, known[-1], aims=True)
             target = law._target(r, known, w)
         return law, target
 
@@ -416,10 +415,16 @@ class Law:
 
     def rested(self, u: Array, d: Array, y: Array) -> Array:
         """Return the e that rests with u, d and y."""
-        e = self.observer.at_rest(u, d, y)
-        for _ in range(0 if self.design.plant.dynamics is None else NEWTON):
-            e = self.at(e, u, d).observer.at_rest(u, d, y)
-        return e
+        plant, tries = self.design.plant, [self.observer.at_rest(u, d, y)]
+        if plant.dynamics is None:
+            return tries[0]
+        for _ in range(NEWTON):
+            tries.append(self.at(tries[-1], u, d).observer.at_rest(u, d, y))
+        tries.append(self.observer.at_rest(plant.point[-len(u) :], d, y))
+        # Newton's method may diverge: of its points and the model's own the one that moves least.
+        n, size = len(plant.A), self.design.scaling.x
+        moves = [(np.abs(self.predicted(e, u, d) - e)[:n] / size).max() for e in tries]
+        return tries[np.nanargmin(moves)]
 
     def _within(self, u: Array, memory: Memory, on_levels: bool = False) -> Array:
         """Return inputs within their bounds, as known signals have them now, or on levels there."""
