@@ -18,7 +18,7 @@ from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.export.writer import Example, Examples, Settings, sources
 
 DRIVER = Path(__file__).parent / "export" / "driver.c"
-STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic")
+STRICT = ("-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-pedantic")
 
 
 def house(horizon: int = 8) -> QPMPC:

@@ -308,7 +308,8 @@ int main(void)
     ("name", "dtype"), [*zip(compilers(), itertools.cycle(("float64", "float32")), strict=False)]
 )
 def test_compilers_and_sanitizers_say_nothing_of_a_controller(tmp_path, name, dtype):
-    two_by_two(y_bounds=(-1.0, 1.0), y_slack=9.0).export_c(tmp_path, dtype=dtype)
+    own = two_by_two(y_bounds=(-1.0, 1.0), y_slack=9.0)
+    own.export_c(tmp_path, dtype=dtype, missing=dtype == "float64")
     (tmp_path / "main.c").write_text(DRIVER)
     files = [str(path) for path in sorted(tmp_path.glob("*.c"))]
     flags = ("-O0", "-Werror", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")

@@ -95,27 +95,27 @@ static void predict(policy_state *s, const real u[])
    seen have V = H P H' + S as covariance of their errors, which is factored as V D V'. */
 static void advance(policy_state *s, const int seen[], real K[N_E][N_Y])
 {
-    real G[N_E][N_Y], V[N_Y][N_Y], X[N_E][N_E];
+    real PH[N_E][N_Y], V[N_Y][N_Y], X[N_E][N_E];
     int at[N_Y], m = 0, i, j, k, a, b;
     for (i = 0; i < N_Y; i++)
         if (seen[i]) at[m++] = i;
     for (i = 0; i < N_E; i++) {
         for (j = 0; j < N_Y; j++) K[i][j] = 0;
         for (a = 0; a < m; a++) {
-            G[i][a] = LS[i][at[a]];
-            for (j = 0; j < N_E; j++) G[i][a] += s->P[i][j] * H[at[a]][j];
+            PH[i][a] = LS[i][at[a]];
+            for (j = 0; j < N_E; j++) PH[i][a] += s->P[i][j] * H[at[a]][j];
         }
     }
     for (a = 0; a < m; a++)
         for (b = 0; b <= a; b++) {
             V[a][b] = S[at[a]][at[b]];
-            for (j = 0; j < N_E; j++) V[a][b] += H[at[a]][j] * (G[j][b] - LS[j][at[b]]);
+            for (j = 0; j < N_E; j++) V[a][b] += H[at[a]][j] * (PH[j][b] - LS[j][at[b]]);
             for (k = 0; k < b; k++) V[a][b] -= V[a][k] * V[b][k] * V[k][k];
             if (b < a) V[a][b] /= V[b][b];
         }
     for (i = 0; i < N_E; i++) {
         for (a = 0; a < m; a++) {
-            real x = G[i][a];
+            real x = PH[i][a];
             for (k = 0; k < a; k++) x -= V[a][k] * K[i][at[k]];
             K[i][at[a]] = x;
         }
@@ -127,7 +127,7 @@ static void advance(policy_state *s, const int seen[], real K[N_E][N_Y])
     for (i = 0; i < N_E; i++)
         for (j = 0; j < N_E; j++) {
             real x = s->P[i][j] + LSL[i][j];
-            for (a = 0; a < m; a++) x -= (G[i][a] * K[j][at[a]] + G[j][a] * K[i][at[a]]) / 2;
+            for (a = 0; a < m; a++) x -= (PH[i][a] * K[j][at[a]] + PH[j][a] * K[i][at[a]]) / 2;
             X[i][j] = x;
         }
     for (i = 0; i < N_E; i++) {
