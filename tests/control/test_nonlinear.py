@@ -12,7 +12,7 @@ from torch import Tensor
 import torch_qpmpc as qm
 import torch_qpmpc.control.law
 from tests.refused import refused
-from torch_qpmpc import QPError
+from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.identification.learned import LearnedModel
 
@@ -143,6 +143,14 @@ def test_a_run_starts_at_rest_and_ends_at_the_set_point():
     run = own.simulate((mixed, *REST), 40, r=[2.5, 30.0])
     assert np.abs(run.y[0] - own.simulate(steps=1, r=[2.5, 30.0]).y[0]).max() < 1e-9
     assert_allclose(run.y[-1], [2.5, 30.0], atol=1e-2)
+
+
+def test_a_run_from_a_state_where_the_model_has_no_slope_says_how_to_start():
+    model = lambda x, u: x + 0.1 * (u - x.sqrt()), [1.0], [1.0]  # at rest with zero: empty
+    own = qm.Controller(qm.LinearMPC(model, 5, Q=1.0, dR=0.1, u_bounds=(0.0, 2.0)))
+    with pytest.raises(SolverError, match="start elsewhere, by u or x"):
+        own.simulate(steps=2, r=[1.5])
+    assert_allclose(own.simulate(steps=60, r=[1.5], u=[1.0]).y[-1], 1.5, atol=1e-2)
 
 
 def test_estimates_and_plans_survive_what_overflows():

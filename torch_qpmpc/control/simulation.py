@@ -146,7 +146,7 @@ def closed_loop(
         signals = Signals(law.read("y", y, 1)[0], set_points[k : k + rows], ahead)
         move = act(signals)
         if move.status not in PLANNED:
-            remedy = "Widen the hard bounds, or give the outputs a y_slack."
+            remedy = "Widen the hard bounds, give outputs a y_slack, or start elsewhere, by u or x."
             raise SolverError(f"Step {k} of the loop has no plan: {move.status.name}. {remedy}")
         observed, *_, info = plant.step(move.u + load)
         y = observed + noise * rng.normal(size=len(noise))
