@@ -52,6 +52,16 @@ def test_inputs_that_the_set_point_leaves_free_are_near_their_target(seed):
         assert np.abs(target.u.numpy() - u).max() < 1e-5
 
 
+@pytest.mark.parametrize("r", [1.02, 1.028])
+def test_a_set_point_that_a_free_input_hardly_moves_is_reached(r):
+    A, B = np.array([[0.9, 0.05], [0.0, 0.8]]), np.array([[0.1, 0.0], [0.02, 0.2]])
+    limits = {"u_bounds": (-1.754, 2.697), "y_bounds": {"h": (-0.53, 0.53)}}
+    limits |= {"constraints": {"sum": ({"p": 1.0, "q": 0.5}, (None, 0.9636))}}
+    names: Any = {"inputs": ["p", "q"], "outputs": ["T", "h"], "Q": {"T": 1.0}}
+    mpc = qm.LinearMPC((A, B), 20, R=0.05, **names, **limits)
+    assert abs(mpc.target([r, 0.0]).y[0] - r) < 1e-8
+
+
 @pytest.mark.usefixtures("rough_fits")
 def test_free_inputs_rest_near_the_log_s_mean_unless_told():
     rng, T = np.random.default_rng(0), np.full(400, 20.0)

@@ -46,7 +46,7 @@ SCALE = 1e-2
 #: An eigenvalue this near to the unit circle is on it.
 ON_CIRCLE = 1e-6
 #: The weight of f - f_0 relative to the outputs', the most rounds, f that stay, and moves alike.
-PREFERENCE, ROUNDS, STAYS, SHRINKS = 0.3, 50, 1e-10, 0.9
+PREFERENCE, ROUNDS, STAYS, SHRINKS = 0.3, 50, 1e-10, 0.999
 #: The price of a hard bound of an output, which a disturbance may make impossible to keep, relative
 #: to the default one.
 HARD = 1e3
