@@ -424,7 +424,7 @@ class Law:
         # Newton's method may diverge: of its points and the model's own the one that moves least.
         n, size = len(plant.A), self.design.scaling.x
         moves = [(np.abs(self.predicted(e, u, d) - e)[:n] / size).max() for e in tries]
-        return tries[np.nanargmin(moves)]
+        return tries[np.nan_to_num(moves, nan=np.inf).argmin()]
 
     def _within(self, u: Array, memory: Memory, on_levels: bool = False) -> Array:
         """Return inputs within their bounds, as known signals have them now, or on levels there."""
