@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -130,6 +132,28 @@ def test_missing_outputs_cost_only_their_information(kind):
     assert len(found.log.trajectories) == 1
     assert off(found, new) < 1.15 * off(qm.identify(log, order=2), new)
     assert "outputs missing" in str(found)
+
+
+def test_a_sensor_that_seldom_answers_is_no_set_point():
+    """Its last value, held between its answers, is constant in most rows: a walk was its model."""
+    rng, y = np.random.default_rng(1), np.zeros((301, 2))
+    u = rng.uniform(-3, 3, (28, 2)).repeat(11, 0)[:300]
+    for k in range(300):
+        y[k + 1] = 0.9 * y[k] + [[0.25, 0.05], [0.02, 0.2]] @ u[k] + 0.02 * rng.normal(size=2)
+    y[np.arange(301) % 10 > 0, 1] = np.nan
+    model = qm.identify({"y": y, "u": u}, order=2).fit.model
+    gain = model.C @ np.linalg.solve(np.eye(2) - model.A, model.B)
+    assert np.allclose(gain, [[2.5, 0.5], [0.2, 2.0]], atol=0.05)
+
+
+def test_the_windows_of_a_log_take_memory_once():
+    """They were kept for each fold and lag: a million rows of five signals took 12 GB."""
+    log = tank(3000, 60, 1)
+    tracemalloc.start()
+    qm.identify(log, order=2)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 4 * (40 * 2 * 3000 * 8), "four times the longest windows"
 
 
 def likelihood(par: Noisy, data: list[Signals]) -> float:

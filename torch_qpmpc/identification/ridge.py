@@ -23,12 +23,11 @@ def ridge(X: Tensor, Y: Tensor, strengths: Tensor = STRENGTHS, share: float = SH
     n, m = X.shape
     size = X.square().mean(0).sqrt()
     scale = torch.where(size > 0, 1 / size, 0.0)
-    basis, target = X * scale, Y
-    outside = Y.new_zeros(Y.shape[1])
+    rows = torch.cat((X * scale, Y), 1)
     if n > m:  # the triangular factor has the same singular values, and fewer rows
-        Q, basis = torch.linalg.qr(basis)
-        target = Q.mT @ Y
-        outside = (Y - Q @ target).square().sum(0)
+        rows = torch.linalg.qr(rows, mode="r").R
+    basis, target = rows[:m].split((m, Y.shape[1]), 1)
+    outside = rows[m:, m:].square().sum(0)
     U, s, Vh = torch.linalg.svd(basis, full_matrices=False)
     a = U.mT @ target
     outside = outside + (target - U @ a).square().sum(0)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # imports its parts at their first use: a fifth of a second
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from torch_qpmpc.identification.filter import Array
 from torch_qpmpc.identification.innovations import Innovations
@@ -56,8 +57,8 @@ SETTLING = 20
 MARGIN, ERRORS, MOST, EXACT = 0.004, 2.0, 0.1, 1e-8
 #: Errors of a model that diverges, in standard deviations.
 WORST = 1e6
-#: Outputs may be unmoved if they are constant in this share of the steps; the number of past inputs
-#: in the test, and its level.
+#: Outputs may be unmoved if this share of their measurements repeats the last one; the number of
+#: past inputs in the test, and its level.
 CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
 #: So many orders, whose starts have the least errors, are compared by their likeliest models; more,
 #: then with other lags, while the rows of their logs together are at most ROWS.
@@ -280,7 +281,7 @@ def _compare(
     if len(orders) == 1 or judged(found)[0].score > np.log(EXACT) + MARGIN:
         for p in feasible if any(orders) else ():
             starts = [_predictor(base, p, max(orders)) for base in bases]
-            shown = min(len(start.s) for start in starts)
+            shown = min(start.states[0].shape[1] for start in starts)
             for n in orders if len(orders) > 1 else (min(orders[0], shown),):
                 if 0 < n <= shown:
                     pars[n, p] = [_states(start, n) for start in starts]
@@ -428,17 +429,19 @@ class _Normal:
 def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     """Return True for outputs that never change, or seldom and whatever the inputs, ``(n_y,)``.
 
-    Changes of an output that is constant in most steps, such as a set-point, are regressed on the
+    Changes of an output that most measurements repeat, such as a set-point, are regressed on the
     last inputs and their squares. An F-test of 1 % decides whether these explain them.
     """
     outputs = [continued(x.y.numpy()) for x in trajectories]
     changes = np.concatenate([np.diff(y, axis=0) for y in outputs])
+    seen = np.concatenate([x.y[1:].isfinite().numpy() for x in trajectories])
     unmoved: Any = ~(changes != 0).any(0)
-    seldom = np.flatnonzero(~unmoved & ((changes == 0).mean(0) >= CONSTANT))
+    repeated = ((changes == 0) & seen).sum(0) >= CONSTANT * seen.sum(0)
+    seldom = np.flatnonzero(~unmoved & repeated)
     use = [(x.u.numpy(), y) for x, y in zip(trajectories, outputs, strict=True) if x.steps > LAST]
     if not len(seldom) or not use:
         return unmoved & ~unmoved.all()
-    windows = [np.lib.stride_tricks.sliding_window_view(u, LAST, 0) for u, _ in use]
+    windows = [sliding_window_view(u, LAST, 0) for u, _ in use]
     U = np.concatenate([w.reshape(len(w), -1) for w in windows])
     U = np.hstack((np.ones((len(U), 1)), U, U**2))
     after = np.concatenate([np.diff(y[LAST - 1 :, seldom], axis=0) for _, y in use])
@@ -511,13 +514,10 @@ def measured(data: Sequence[Signals], filled: Sequence[Signals]) -> Innovations:
 
 
 class _Predictor(NamedTuple):
-    """Windows of p steps, the steps after them, and the directions that predict the most."""
+    """States of windows of p steps, those that predict the most first, and the steps after."""
 
-    windows: list[Array]
+    states: list[Array]
     after: list[Signals]
-    Vh: Array
-    s: Array
-    G: Array
     first: Array
 
 
@@ -528,28 +528,27 @@ def _predictor(data: Sequence[Signals], lags: int, order: int) -> _Predictor:
     for y, v in _runs(data):
         if len(v) >= lags:
             w = np.hstack((y[:-1], v[:, :-1]))
-            count = len(w) - lags + 1
-            windows.append(np.hstack([w[i : i + count] for i in range(lags)]))
+            windows.append(sliding_window_view(w.ravel(), lags * w.shape[1])[:: w.shape[1]])
             after.append(Signals(y[lags:], v[lags:]))
     Z, F = np.concatenate(windows), np.concatenate([y for y, _ in after])
-    W = ridge(torch.as_tensor(np.hstack((Z, np.ones((len(Z), 1))))), torch.as_tensor(F)).numpy()
-    q = Z.shape[1] // lags
+    Z, q = np.hstack((Z, np.ones((len(Z), 1)))), Z.shape[1] // lags
+    W = ridge(torch.as_tensor(Z), torch.as_tensor(F)).numpy()
     step, rows = np.eye(len(W) - 1, k=q), [W[:-1].T]
     step[-q : n_y - q or None] = W[:-1].T
     for _ in range(max(*HORIZONS, order) - 1):
         rows.append(rows[-1] @ step)
     G = np.concatenate(rows)
     first = np.mean([y[0] for y, _ in _runs(data)], 0)
-    _, s, Vh = np.linalg.svd(np.linalg.qr(Z, mode="r") @ G.T, full_matrices=False)
-    s = s[s > 1e-9 * s[0]] / np.sqrt(len(Z))
-    return _Predictor(windows, after, Vh, s, G, first)
+    _, s, Vh = np.linalg.svd(np.linalg.qr(Z[:, :-1], mode="r") @ G.T, full_matrices=False)
+    s = s[s > 1e-9 * s[0]][:order] / np.sqrt(len(Z))
+    T = (Vh[: len(s)] / s[:, None]) @ G
+    return _Predictor([z @ T.T for z in windows], after, first)
 
 
 def _states(predictor: _Predictor, order: int) -> Noisy:
-    """Return the model of the first ``order`` directions, by least squares."""
-    windows, after, Vh, s, G, first = predictor
-    T = (Vh[:order] / s[:order, None]) @ G
-    X, F = [z @ T.T for z in windows], np.concatenate([y for y, _ in after])
+    """Return the model of the first ``order`` states, by least squares."""
+    X, after, first = [x[:, :order] for x in predictor.states], predictor.after, predictor.first
+    F = np.concatenate([y for y, _ in after])
     V = np.concatenate([np.hstack((x[:-1], v)) for x, (_, v) in zip(X, after, strict=True)])
     X1, X0 = np.concatenate([x[1:] for x in X]), np.concatenate(X)
     AB, C = (np.linalg.lstsq(x.T @ x, x.T @ z, rcond=None)[0].T for x, z in ((V, X1), (X0, F)))
