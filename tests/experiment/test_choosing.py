@@ -264,7 +264,7 @@ def test_a_run_starts_from_networks_learns_the_cost_and_resumes(tmp_path, monkey
     stop(monkeypatch, cfg, cut, 3)
     run_command(*DATA, *settings, "constraint=deviation", f"hydra.run.dir={cut}")
     said = capsys.readouterr().out
-    assert "C and of b, which are not learned. theta's cost is, from 32 transitions" in said
+    assert "C and b, and stay as fitted. Only theta's cost is learned, from 32 tr" in said
     resumed = FinishedRun(cut)
     for key in ("J_start", "J_best", "start", "accepted", "rejected"):
         assert run.summary[key] == resumed.summary[key]

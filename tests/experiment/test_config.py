@@ -154,7 +154,8 @@ def test_missing_keys(key):
     ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
     ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),
     ("rivals=[nobody]", r"rivals: got \['nobody'\], expected .* identification. They are the"),
-    ("num_envs=7", r"replay_capacity: got 16000, expected a multiple of num_envs = 7"),
+    ("num_envs=7", "replay_capacity: got 16000, .* num_envs = 7, .* Set replay_capacity=15960."),
+    ("replay_capacity=32", "replay_capacity: got 32, expected .* and at least 160. Set .*=160."),
 )
 def test_values_that_do_not_fit_each_other(overrides):
     make_config(*overrides.split())

@@ -216,11 +216,13 @@ def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
 
 def test_damaged_logs_are_named(tmp_path):
     cfg = make_config(*DATA, f"start.file={tmp_path / 'log.pt'}")
-    physics = make_physics(cfg)
+    physics, steps = make_physics(cfg), torch.zeros(3, 1)
     for content, message in (
-        (None, r"start\.file: got .*log\.pt, which does not exist, expected a log\.pt that"),
-        ({"observation": torch.zeros(3)}, r"start\.file: got .*log\.pt, without actions, expected"),
-        (b"text", r"start.file: got .*log\.pt, which cannot be read"),
+        (None, r"start\.file: got .*, which cannot be read \(FileNotFoundError\), expected a log"),
+        (b"text", r"start\.file: got .*log\.pt, which cannot be read \(BadZipFile\)"),
+        ({"observation": steps}, r"start\.file: got .*log\.pt \('action'\), expected a log\.pt"),
+        ({"action": steps, "observation": steps}, r"log\.pt \(.*\"next\" not found.*guides"),
+        ({"action": steps, "observation": steps[:2]}, r"log\.pt \(batch dimension mismatch"),
     ):
         if isinstance(content, bytes):
             Path(cfg.start.file).write_bytes(content)
@@ -228,4 +230,7 @@ def test_damaged_logs_are_named(tmp_path):
             torch.save(content, cfg.start.file)
         with pytest.raises(QPError, match=message):
             make_start(cfg, physics, tmp_path, written=False)
+    (tmp_path / LOG).unlink()
+    with pytest.raises(QPError, match=r"^log\.pt: got .*log\.pt, which cannot be read .*wrote\.$"):
+        make_start(make_config(*DATA), physics, tmp_path, written=True)
     assert make_start(make_config(), physics, tmp_path, written=False) is None

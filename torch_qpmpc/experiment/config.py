@@ -82,15 +82,6 @@ class TaskSettings(Group):
         """The importable modules that the keys name."""
         return []
 
-    @model_validator(mode="after")
-    def riccati_is_dense(self) -> Self:
-        if self.terminal_weight == "riccati" and self.hessian == "diagonal":
-            remedy = "The Riccati weight needs task.hessian=block."
-            raise QPError.expected(
-                "task.terminal_weight", "'riccati'", "default or identity", remedy
-            )
-        return self
-
 
 class UnreadSettings(TaskSettings, extra="allow"):
     """The keys of a task whose script has not run, without checks."""
@@ -265,8 +256,14 @@ class Config(Group):
             self.conflict("constraint.structure", "free", remedy)
         if tied and "G" in part.learn:
             self.conflict("constraint.learn", "no G", "No task has mixed constraints to learn.")
-        if self.replay_capacity % self.num_envs:
-            self.conflict("replay_capacity", f"a multiple of num_envs = {self.num_envs}")
+        if self.task.terminal_weight == "riccati" and self.task.hessian == "diagonal":
+            remedy = "The Riccati weight needs task.hessian=block."
+            self.conflict("task.terminal_weight", "default or identity", remedy)
+        least = self.task.horizon * self.num_envs
+        if self.replay_capacity % self.num_envs or self.replay_capacity < least:
+            expected = f"a multiple of num_envs = {self.num_envs}, and at least {least}"
+            remedy = f"Set replay_capacity={max(self.replay_capacity // least, 1) * least}."
+            self.conflict("replay_capacity", expected, remedy)
         if part.si and (self.task.episode_steps or self.task.horizon) < self.task.horizon:
             remedy = "constraint.si needs windows of task.horizon steps."
             expected = f"at least task.horizon = {self.task.horizon}"

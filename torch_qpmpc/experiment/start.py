@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -73,7 +74,7 @@ def make_start(
     if written:
         log = stored_log(path)
     elif cfg.start.file is not None:
-        log = stored_log(Path(cfg.start.file))
+        log = stored_log(cfg.start.file, "start.file", FORMAT)
     else:
         log = collect_log(cfg, physics)
     if not cfg.task.start_episodes:
@@ -137,15 +138,16 @@ def read_observer(folder: Path) -> Innovations | None:
         raise damaged(path, error, "the observer that a run wrote") from error
 
 
-def stored_log(path: str | Path) -> TensorDict:
-    """Read a log of `collect_log`, a nested dict of tensors that ``torch.save`` wrote."""
-    if not Path(path).exists():
-        raise QPError.expected("start.file", f"{path}, which does not exist", WANTED)
+def stored_log(path: str | Path, name: str = LOG, remedy: str = "") -> TensorDict:
+    """Read a log of `collect_log`, a nested dict of tensors, which errors call ``name``."""
+    wrong = partial(QPError.expected, name, expected=WANTED, remedy=remedy)
     try:
         stored = read_tensors(Path(path))
     except Exception as error:  # damaged files raise errors of any type
-        got = f"{path}, which cannot be read ({type(error).__name__})"
-        raise QPError.expected("start.file", got, WANTED, FORMAT) from error
-    if not isinstance(stored, dict) or not isinstance(stored.get("action"), Tensor):
-        raise QPError.expected("start.file", f"{path}, without actions", WANTED, FORMAT)
-    return TensorDict(stored, batch_size=stored["action"].shape[:-1])
+        raise wrong(f"{path}, which cannot be read ({type(error).__name__})") from error
+    try:
+        log = TensorDict(stored, batch_size=stored["action"].shape[:-1])
+        _ = log["observation"], log["next", "observation"]
+    except Exception as error:  # files of something else raise errors of any type, too
+        raise wrong(f"{path} ({error})") from error
+    return log

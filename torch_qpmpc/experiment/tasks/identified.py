@@ -44,8 +44,8 @@ FARTHER = 2.5
 #: The weight of an action in a nonlinear scheme, relative to the costs of the log, for one minimum.
 TINY = 1e-6
 NETWORKS = (
-    "Networks take the place of this model, of C and of b, which are not learned. theta's cost is, "
-    f"from {FEWER} transitions an update, because a nonlinear plan takes as long as many QPs."
+    "Networks replace this model, C and b, and stay as fitted. Only theta's cost is learned, from "
+    f"{FEWER} transitions an update: a nonlinear plan takes as long as many QPs."
 )
 
 
@@ -112,7 +112,8 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
         remedy = "".join(f"The plant ends them by {x}." for x in getattr(physics, "raised", [])[:1])
         reward = log.get(("next", "reward"), log["action"])
         what = "step" if remedy or reward.isfinite().any() else "reward"
-        raise QPError.expected("start", f"{cut} episodes without a finite {what}", "a log", remedy)
+        got = f"{cut} episodes without a finite {what}"
+        raise QPError.expected("start", got, f"finite {what}s in a log", remedy)
     observed = not isinstance(physics, LinearSystem)
     if observed:
         sizes = (physics.n_y, physics.n_d) if isinstance(physics, Plant) else (physics.n_x, 0)
