@@ -61,10 +61,8 @@ def rate(controller: qm.Controller, kind: str, seed: int, steps: int) -> tuple[f
     return float((T > BOUND).mean()), float(((T - BEYOND) ** 2).mean())
 
 
-def normal_margin(model: Any, share: float | None) -> float:
+def normal_margin(model: Any, share: float) -> float:
     """Return the distance from the bound that a normal error exceeds with a chance ``share``."""
-    if share is None:
-        return 0.0
     own = model.model
     variance, response = own.S[0, 0], own.L
     for _ in range(1, AHEAD):
@@ -83,12 +81,12 @@ def rates(seeds: int, steps: int) -> str:
         for seed in range(seeds):
             model = identified(kind, FIRST + seed)
             for i, share in enumerate(SHARES):
-                top = BOUND - normal_margin(model, share)
-                own = qm.LinearMPC(
-                    model, HORIZON, y_bounds=(0.0, BOUND), violation=share, **options
-                )
-                normal = qm.LinearMPC(model, HORIZON, y_bounds=(0.0, top), **options)
-                for run, mpc in zip(runs, (own, normal), strict=True):
+                designs = [(BOUND, share)]
+                if share is not None:
+                    designs.append((BOUND - normal_margin(model, share), None))
+                for run, (top, asked) in zip(runs, designs, strict=False):
+                    bounds = {"y_bounds": (0.0, top), "violation": asked}
+                    mpc = qm.LinearMPC(model, HORIZON, **bounds, **options)
                     run[seed, i] = rate(qm.Controller(mpc), kind, FIRST + seed, steps)
         for name, run in zip((kind, QUANTILE), runs, strict=True):
             wide = 196 * run[..., 0].std(0) / np.sqrt(max(seeds - 1, 1))
