@@ -146,6 +146,11 @@ def test_without_a_step_there_is_nothing_to_explain(change):
         made.explain()
 
 
+def test_hard_bounds_are_looked_for_without_a_plan_only(monkeypatch):
+    monkeypatch.delattr("torch_qpmpc.control.explain.hard_rows")
+    assert "hard bounds" not in stepped().explain().reach
+
+
 def test_hard_bounds_without_a_plan_are_named():
     made = controller(y_bounds={"T": (-1.0, 4.5)}, y_slack={"T": np.inf})
     made.reset(y=[9.0, 0.0], u=[0.0], known={"d": 1.0, "most": 2.0})

@@ -179,6 +179,8 @@ def test_logs_of_other_signals_or_steps_and_constant_signals_are_named():
     controller = made(WRONG, inputs=["q"])
     with pytest.raises(QPError, match=r"^log: got inputs \('u1',\), expected the controller's \("):
         controller.learn(logged())
+    with pytest.raises(QPError, match=r"^known: got signals beside a log, expected None: the log"):
+        controller.learn(logged(), known=[0.3])
     controller = made(WRONG, E=[[0.1]], known=["sun"])
     with pytest.raises(QPError, match=r"^known: got a constant sun, expected one that varies"):
         controller.learn(Lag(), known=[0.3], **{**QUICK, "transitions": 12})

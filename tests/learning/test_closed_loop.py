@@ -337,7 +337,8 @@ NOTHING = qm.QPMPC.from_model(PointMass().A, PointMass().B, 3, stage_weight=[1.0
     ({"plant": ManyModels(), "held_out": 16}, "held_out: got 16, .* whole number >= 18"),
     ({"rate": 0.0}, "rate: got 0.0"),
     ({"seed": -1}, "seed: got -1"),
-    ({"cost": lambda p, u: p[:, 0]}, "cost: got a function, expected None: the plant has a cost"),
+    ({"cost": lambda p, u: p[:, 0]}, "cost, members: got other ones, expected the plant's own"),
+    ({"members": 3}, "cost, members: got other ones"),
 )
 def test_improve_refuses(change):
     plant = PointMass()

@@ -678,8 +678,7 @@ def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
 
 def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:
     """Read bounds by name, or as one pair of numbers or vectors; those of moves contain zero."""
-    if value is None:
-        value = {}
+    value = {} if value is None else value
     if isinstance(value, Mapping):
         if unknown := sorted({*value} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")

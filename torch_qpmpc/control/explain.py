@@ -106,7 +106,7 @@ def explain(
     w = law.estimates(memory)[1]
     names = dict(zip(design.disturbances.names, w.tolist(), strict=True))
     findings = [set_points(mpc, w, known[0], memory.r, False)]
-    findings += [x for x in [hard_rows(design)] if status == Outcome.INFEASIBLE and not x.ok]
+    findings += [x] if status == Outcome.INFEASIBLE and not (x := hard_rows(design)).ok else []
     reach = "\n".join(f"{x.text} {x.remedy}".rstrip() for x in findings)
     return Explanation(design, status, now, u, y, limits, names, reach)
 

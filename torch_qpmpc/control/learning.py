@@ -120,6 +120,8 @@ def learn(
 
         plant = Plant("the environment", source, options)
         log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
+    elif known is not None:
+        raise QPError.expected("known", "signals beside a log", "None: the log has its own")
     else:
         log, held_out = _parts(_checked(as_log(source), law.design.plant))
         middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
@@ -127,8 +129,7 @@ def learn(
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
-    before, after = np.mean(costs, axis=0).tolist()
-    shown = test.decision == "better", before, after, test.pairs, test.interval
+    shown = test.decision == "better", *np.mean(costs, 0).tolist(), test.pairs, test.interval
     return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 

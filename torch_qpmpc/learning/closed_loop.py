@@ -499,8 +499,8 @@ def improve(
     check_seed(seed)
     if isinstance(plant, Identified):
         plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), mpc.horizon, members, seed)
-    elif cost is not None:
-        raise QPError.expected("cost", "a function", "None: the plant has a cost of its own")
+    elif cost is not None or members != MEMBERS:
+        raise QPError.expected("cost, members", "other ones", "the plant's own, by their defaults")
     if missing := [name for name in METHODS if not callable(getattr(plant, name, None))]:
         got = f"{type(plant).__name__}, without {', '.join(missing)}"
         raise QPError.expected("plant", got, "an identified model, or a LinearSystem's methods")
