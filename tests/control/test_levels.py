@@ -168,6 +168,8 @@ def test_bounds_are_those_of_the_levels_within_them():
 @refused(
     ({"u_levels": {"p": LEVELS}}, "u_levels: got {'p': .*, expected a mapping from"),
     ({"u_levels": LEVELS}, "u_levels: got .* expected a mapping"),
+    ({"u_levels": np.zeros(2)}, "u_levels: got .* expected a mapping"),
+    ({"u_levels": None, "min_on": "two"}, "min_on: got 'two', expected action_levels or u_level"),
     ({"u_levels": {"q": 3}}, "u_levels: got .3., expected for each action up to 100 ascending"),
     ({"min_on": {"T": 2}}, "min_on: got 'T', expected names among q"),
     ({"u_bounds": {"q": (1.0, 2.0)}}, "u_bounds: got .1, 2. of q"),

@@ -94,6 +94,11 @@ def test_every_argument_is_redesigned_or_refused():
             made().redesign(**{name: None})
 
 
+def test_a_weight_by_name_that_is_no_number_is_named():
+    with pytest.raises(QPError, match=r"^Q: got \[.*'high'.*\], expected a tensor, or what"):
+        made().redesign(Q={"a": "high"})
+
+
 def test_an_input_without_a_new_limit_keeps_its_own():
     controller = made(y_bounds=None, du_bounds=None)
     ahead = {"low": 0.0, "cap": 0.7}

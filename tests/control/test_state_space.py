@@ -3,13 +3,14 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.integrate
 import scipy.signal
 import torch
 
 from tests.refused import refused
-from torch_qpmpc import QPError
+from torch_qpmpc import QPError, read_log
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
@@ -48,6 +49,15 @@ def test_a_discrete_system_keeps_its_matrices_and_time():
     assert read_model(system(dt=True), dt=0.3).dt == 0.3
     transfer = scipy.signal.dlti([0.5], [1.0, -0.9], dt=1.0)
     assert np.allclose(read_model(transfer).A, [[0.9]])
+
+
+@pytest.mark.parametrize("names", [np.array, pd.Index, tuple, list])
+def test_names_are_any_sequence_or_one(names):
+    plant = read_model((A, B), inputs="force", outputs=names(["T", "h"]), known=names(["d", "e"]))
+    assert (plant.inputs, plant.outputs, plant.known) == (("force",), ("T", "h"), ("d", "e"))
+    frame = pd.DataFrame({"force": [0.0, 1.0, 0.0], "T": [1.0, 2.0, 4.0], "h": [0.0, 1.0, 3.0]})
+    log = read_log(frame, outputs=names(["T", "h"]), inputs="force")
+    assert (log.inputs, log.outputs) == (("force",), ("T", "h"))
 
 
 def test_named_inputs_of_a_system_become_known_signals():
@@ -106,7 +116,9 @@ def test_the_state_space_of_an_identification_has_its_predictions():
     ((A, [1.0, 2.0]), {}, r"model\[1\]: got shape \(2,\), expected a matrix"),
     ((A, np.ones((3, 1))), {}, r"B: got shape \(3, 1\), expected \(2, 1\)"),
     ((A, B, np.ones((1, 3))), {}, r"C_y: got shape \(1, 3\), expected \(1, 2\)"),
-    ((A, B), {"inputs": ["y1"]}, "names: got 'y1' twice, expected different names"),
+    ((A, B), {"inputs": ["y1"]}, "names: got 'y1', expected different strings. Inputs, outputs a"),
+    ((A, B), {"inputs": 3}, "names: got 3, expected different strings"),
+    ((A, B), {"outputs": ["T"]}, r"C_y: got shape \(2, 2\), expected \(1, 2\). Each .* one name"),
     ((A, B), {"E": np.ones((2, 1)), "known": ["a", "b"]}, r"E: got shape \(2, 1\), expected"),
     (system(dt=1.0, input_labels=["q"]), {"known": ["T"]}, "known: got 'T', expected inputs among"),
 )

@@ -161,6 +161,8 @@ def test_a_missing_output_corrects_nothing():
 
 
 def test_an_environment_of_other_sizes_is_named():
+    with pytest.raises(QPError, match=r"^model: got tuple, expected an Innovations. Of an ident"):
+        KalmanFilter(([[0.9]], [[0.5]]))  # pyright: ignore[reportArgumentType] - the mistake
     with pytest.raises(QPError, match=r"observation_key: got s, expected one of observation"):
         _ = transformed(pendulum(), KalmanFilter(MODEL, observation_key="s")).observation_spec
     message = r"the environment: got outputs and actions of sizes \(3, 1\), .*of sizes \(2, 1\)"

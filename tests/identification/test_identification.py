@@ -196,6 +196,12 @@ def test_a_mistake_is_named(call):
     call()
 
 
+def test_a_log_too_short_for_any_order_is_told():
+    """Windows of two steps must be in half of the steps, and twice as many as their entries."""
+    with pytest.warns(UserWarning, match="order: 8 steps show no states but the outputs"):
+        assert qm.identify(lag_log(0.1, 8), order=3).fit.order == 0
+
+
 def test_matrices_are_of_numpy_and_can_be_read():
     model = qm.identify(lag_log()).model
     np.testing.assert_allclose(model.A, [[0.9, 0.2], [-0.1, 0.7]], atol=1e-8)

@@ -265,6 +265,8 @@ def test_a_response_that_is_rare_is_no_error():
     ([], {}, "data: got an empty list, expected a CSV file"),
     ("none.csv", {}, r"data: got none.csv, which cannot be read \(.*No such file"),
     ("http://a.b/c.csv", {}, r"data: got http://a.b/c.csv, which cannot be read"),
+    (room(), {"inputs": [None]}, "column: got 'None', which is missing"),
+    ({"T": np.ones(9), "q": []}, {}, "q: got 0 rows, expected 9 rows, as others, or 8"),
     (room(), {"outputs": ["p"]}, "column: got 'p', which is missing, expected one of t, T, q,"),
     (room(), {"inputs": ["T"]}, "column: got 'T' twice, expected each once"),
     (room(), {"outputs": None}, "outputs: got none, and columns t, T, q, T_out, expected nam"),

@@ -339,6 +339,8 @@ NOTHING = qm.QPMPC.from_model(PointMass().A, PointMass().B, 3, stage_weight=[1.0
     ({"seed": -1}, "seed: got -1"),
     ({"cost": lambda p, u: p[:, 0]}, "cost, members: got other ones, expected the plant's own"),
     ({"members": 3}, "cost, members: got other ones"),
+    ({"cost": 1.0}, "cost: got float, expected a function, or None"),
+    ({"penalty": 1.0}, "penalty: got float, expected a function, or None"),
 )
 def test_improve_refuses(change):
     plant = PointMass()

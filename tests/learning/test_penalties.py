@@ -1,6 +1,7 @@
 """The penalties against the paper's formulas, written out entry by entry."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,8 @@ def test_deviation_penalty_entry_by_entry(generator):
     mpc = make_mpc(generator)
     C_0 = mpc.C_0
     C = C_0 + normal(generator, *C_0.shape)
-    penalty = DeviationPenalty(mpc, c_1=2.0, c_2=0.5, c_3=0.25)
+    c_1: Any = np.float32(2.0)
+    penalty = DeviationPenalty(mpc, c_1=c_1, c_2=0.5, c_3=0.25)
     mask = penalty.C_mask
     total = sum(
         abs(mask[i, j] * (C[i, j] - C_0[i, j])).item()

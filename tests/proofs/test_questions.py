@@ -38,7 +38,7 @@ def test_the_corner_is_the_worst_start_of_a_double_integrator():
     assert "from p = [" in str(answer)
 
 
-@pytest.mark.parametrize("steps", [1, 2])
+@pytest.mark.parametrize("steps", [1, np.int64(2)])
 def test_no_sample_exceeds_a_proved_bound(steps):
     mpc, small = scheme(), Polytope.box([-0.6, -0.3], [0.6, 0.3])
     answer = largest_violation(

@@ -153,7 +153,7 @@ def read(
 def structure_metrics(mpc: QPMPC) -> dict[str, float]:
     """Return the numbers of `read` that measure the distance to an MPC scheme, for logs.
 
-    All are nan if C has no prediction form, so that training continues.
+    They are nan, so that training continues, if C has no prediction form or dynamics replace it.
     """
     check_kind("mpc", mpc, QPMPC)
     names = ("causality_defect", "toeplitz_defect", "distance_to_mpc")

@@ -128,15 +128,13 @@ class Design:
             got = f"{self.violation}, which leaves no room between the bounds"
             raise QPError.expected("violation", got, "larger shares, or wider y_bounds")
         if (self.slack < 0).any():
-            raise QPError.expected(
-                "y_slack", f"{self.y_slack}", "prices >= 0, or inf for hard rows"
-            )
+            want = "prices >= 0, or inf for hard rows"
+            raise QPError.expected("y_slack", f"{self.y_slack}", want)
 
     def __str__(self) -> str:
         plant, weights = self.plant, {"Q": self.Q, "R": self.R, "dR": self.dR}
-        y, u, d = (
-            ", ".join(map(plant.label, x)) for x in (plant.outputs, plant.inputs, plant.known)
-        )
+        named = plant.outputs, plant.inputs, plant.known
+        y, u, d = (", ".join(map(plant.label, names)) for names in named)
         parts = [f"{y} by {u}", *([f"known {d}"] if d else []), f"horizon {self.horizon}"]
         parts += [f"{name} {np.diag(x).tolist()}" for name, x in weights.items() if x.any()]
         return "; ".join(parts)
@@ -156,11 +154,11 @@ class Design:
             limits = [limited.get(x, ("", "")) for x in names]
             pairs = [[a or x, b or y] for (a, b), (x, y) in zip(limits, sides, strict=True)]
             return {**dict(zip(names, pairs, strict=True)), **changes}
-        weight = old.copy()
+        weight, values = old.copy(), read_vector(name, changes, names, 0.0)
         for i, value in ((names.index(x), value) for x, value in changes.items()):
             if value is None:
                 weight[i] = weight[:, i] = 0.0
-            weight[i, i] = 0.0 if value is None else value
+            weight[i, i] = values[i]
         return weight
 
     @property
@@ -562,10 +560,10 @@ def read_switching(u_levels: Any, plant: StateSpace, **rules: Any) -> dict[str, 
     Raises:
         QPError: a name is no input with levels, or a level is no number.
     """
+    if not isinstance(u_levels, Mapping | None) or {*(u_levels or ())} - {*plant.inputs}:
+        raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
     if not u_levels:
         return {"switching": rules}
-    if not isinstance(u_levels, Mapping) or {*u_levels} - {*plant.inputs}:
-        raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
     levels = dict(zip(u_levels, read_levels([*u_levels.values()], "u_levels"), strict=True))
     for name in ("min_on", "min_off", "start_cost"):
         numbers = read_vector(name, rules[name], [*levels], DEFAULTS[name])

@@ -129,7 +129,8 @@ def learn(
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
-    shown = test.decision == "better", *np.mean(costs, 0).tolist(), test.pairs, test.interval
+    before, after = np.mean(costs, axis=0).tolist()
+    shown = test.decision == "better", before, after, test.pairs, test.interval
     return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
 
 

@@ -63,8 +63,8 @@ class LinearMPC:
         horizon: N.
         Q, R, dR: weights by name, as a number, a vector or a matrix; zero by default.
         y_bounds, u_bounds, du_bounds: pairs (lower, upper) by name, or one pair; unbounded by
-            default. Bounds of inputs and moves are hard. A bound of an output or input may be the
-            name of a known signal that acts on no state: it then varies over the horizon.
+            default. Of inputs and moves they are hard; a target ignores those of moves. Bounds of
+            outputs and inputs may be names of known signals that act on no state, and then vary.
         y_slack: the price of a unit of violation of an output's bounds; inf makes them hard. By
             default a violation by half the distance between the bounds costs 1000 times a stage
             with all signals that far off the target.

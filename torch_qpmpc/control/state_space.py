@@ -63,17 +63,16 @@ class StateSpace:
     point: Any = None
 
     def __post_init__(self) -> None:
-        n = len(self.A)
-        sizes = {"A": n, "B": len(self.inputs), "E": len(self.known)}
-        for name, columns in sizes.items():
-            if (got := getattr(self, name).shape) != (n, columns):
-                raise QPError.expected(name, f"shape {got}", f"({n}, {columns})")
-        if self.C.shape != (len(self.outputs), n):
-            raise QPError.expected("C_y", f"shape {self.C.shape}", f"({len(self.outputs)}, {n})")
+        n, m, n_y, n_d = len(self.A), *map(len, (self.inputs, self.outputs, self.known))
+        shapes = {"A": (n, n), "B": (n, m), "E": (n, n_d), "C_y": (n_y, n)}
+        for name, shape in shapes.items():
+            if (got := getattr(self, name[0]).shape) != shape:
+                remedy = "Each column of B and E, and each row of C_y, has one name."
+                raise QPError.expected(name, f"shape {got}", f"{shape}", remedy)
         names = (*self.inputs, *self.outputs, *self.known)
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        if wrong := [x for x in names if not isinstance(x, str) or names.count(x) > 1]:
             remedy = "Inputs, outputs and known signals are addressed by name."
-            raise QPError.expected("names", f"{twice[0]!r} twice", "different names", remedy)
+            raise QPError.expected("names", f"{wrong[0]!r}", "different strings", remedy)
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -146,9 +145,11 @@ def read_model(
     """
     if dt is not None:
         check_number("dt", dt, lambda x: 0 < x < np.inf, "a sampling time > 0")
+    named = inputs, outputs, known
+    inputs, outputs, known = ([] if x is None else np.atleast_1d(x).tolist() for x in named)
     if isinstance(model, StateSpace):
-        own = {"E": E, "dt": dt, "inputs": inputs, "outputs": outputs, "known": known or None}
-        _check_absent("a StateSpace has its own", **own)
+        own = {"inputs": inputs or None, "outputs": outputs or None, "known": known or None}
+        _check_absent("a StateSpace has its own", E=E, dt=dt, **own)
         return model
     if isinstance(model, LearnedModel):
         if model.identified is None:

@@ -60,10 +60,8 @@ class GrosZanonLTI(LinearSystem):
 
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return L(s, a) = 1/2 (|s|^2 + 1/2 a^2 + w violation(s)) ``(*batch,)``, with a clipped."""
-        squares = (
-            check_tensor("s", s, len(self.A)).to(self.A).square().sum(-1)
-            + self.applied(a).square().sum(-1) / 2
-        )
+        x, u = check_tensor("s", s, len(self.A)).to(self.A), self.applied(a)
+        squares = x.square().sum(-1) + u.square().sum(-1) / 2
         return (squares + self.w * self.violation(s)) / 2
 
     def starts(self, rng: Rng, count: int) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from torch_qpmpc.checks import check_tensor
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.innovations import Innovations
 
@@ -69,6 +69,7 @@ class KalmanFilter(Transform):
         observation_key: NestedKey = "observation",
         estimate_key: NestedKey | None = None,
     ) -> None:
+        check_kind("model", model, Innovations, "Of an identification it is its model.")
         self.observation_key = observation_key
         self.estimate_key = observation_key if estimate_key is None else estimate_key
         super().__init__(in_keys=[observation_key], out_keys=[self.estimate_key])

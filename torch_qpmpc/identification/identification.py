@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -170,8 +171,8 @@ def identify(
             "observation")``. Done flags and the ids of trajectories are respected. A list or lazy
             stack of logs may have different lengths.
         horizon: N, the number of steps of the predictions that are reported.
-        order: the number of states but disturbances, or the most that the log shows; by default
-            errors of held-out predictions choose it. 0: the state is the outputs, measured exactly.
+        order: the number of states but disturbances, or the most that the log shows (with a warning
+            if that is none); by default held-out errors choose. 0: the outputs, measured exactly.
         n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
             they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``; all of them by default.
@@ -195,6 +196,8 @@ def identify(
     log = as_log(trajectories, n_x, n_d)
     check_excitation(log)
     fit = fit_state_space(log.trajectories, order)
+    if order and not fit.order:
+        warnings.warn(f"order: {log.steps} steps show no states but the outputs", stacklevel=2)
     return Identified(fit.model.disturbed(), log, int(horizon), fit)
 
 

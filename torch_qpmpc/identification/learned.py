@@ -128,9 +128,8 @@ def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
     if given:
         x = own.fit.model.estimates
         data = [(torch.as_tensor(x(*map(np.asarray, z))), *z[1:]) for z in own.log.trajectories]
-    x, after, u, d = (
-        torch.cat(part) for part in zip(*((y[:-1], y[1:], u, d) for y, u, d in data), strict=True)
-    )
+    parts = zip(*((y[:-1], y[1:], u, d) for y, u, d in data), strict=True)
+    x, after, u, d = map(torch.cat, parts)
     if cost is not None:
         cost = torch.as_tensor(cost, dtype=torch.float64).reshape(-1)
         if len(cost) != len(u):

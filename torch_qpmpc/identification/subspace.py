@@ -128,9 +128,8 @@ def fit_state_space(
             held, many = _Held(trajectories), steady(likely)
             model = many if _far(many, data, held) <= _far(model, data, held) else model
         model = readable(model, data)
-    return Fit(
-        normal.restore(model), order or 0, lags, tuple(rows), tuple(map(normal.restore, parts))
-    )
+    model, *parts = map(normal.restore, (model, *parts))
+    return Fit(model, order or 0, lags, tuple(rows), tuple(parts))
 
 
 def held_out_errors(
@@ -450,9 +449,8 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
         m, left = U.shape[1] - 1, len(U) - U.shape[1]
         if left > 0:
             explained = ((target - target.mean()) ** 2).sum() - rest @ rest
-            unmoved[i] = (
-                scipy.special.fdtrc(m, left, explained / max(rest @ rest, TINY) * left / m) > LEVEL
-            )
+            ratio = explained / max(rest @ rest, TINY) * left / m
+            unmoved[i] = scipy.special.fdtrc(m, left, ratio) > LEVEL
     return unmoved & ~unmoved.all()
 
 

@@ -43,8 +43,8 @@ def read_tables(
     marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
     headers, units = _name_columns(frames)
     frame = pd.concat(frames, ignore_index=True)
-    listed = [[x] if isinstance(x, str) else x for x in signals]
-    chosen = [x and [headers.get(str(name).strip(), name) for name in x] for x in listed]
+    listed = [x if x is None else np.atleast_1d(x).astype(str).tolist() for x in signals]
+    chosen = [x and [headers.get(name.strip()) or name for name in x] for x in listed]
     time, episode = (x if x is None else headers.get(str(x).strip(), x) for x in (time, episode))
     taken = {time, episode, *(name for names in chosen for name in names or ())}
     kinds = zip(chosen, "yud", ("outputs", "inputs", "known"), strict=True)
@@ -116,7 +116,7 @@ def _frame(part: Any) -> pd.DataFrame:
         array = np.asarray(ungraded(str(name), value))
         if array.ndim not in (1, 2):
             raise QPError.expected(str(name), f"shape {array.shape}", "shape (T,) or (T, n)")
-        for i, column in enumerate(array.reshape(len(array), -1).T):
+        for i, column in enumerate(np.atleast_2d(array.T)):
             single = array.ndim == 1 or array.shape[1] == 1
             columns[name if single else f"{name}{i + 1}"] = pd.Series(column)
     longest = max((len(column) for column in columns.values()), default=0)

@@ -497,6 +497,9 @@ def improve(
         check_whole(name, size, 1)
     check_number("rate", rate, *POSITIVE)
     check_seed(seed)
+    for name, function in {"cost": cost, "penalty": penalty}.items():
+        if not (function is None or callable(function)):
+            raise QPError.expected(name, type(function).__name__, "a function, or None")
     if isinstance(plant, Identified):
         plant = simulated_plant(plant, cost or stage_cost(mpc.scheme), mpc.horizon, members, seed)
     elif cost is not None or members != MEMBERS:

@@ -258,12 +258,8 @@ class GaussNewton(torch.optim.Optimizer):
 
     def __reduce__(self) -> tuple:
         # The copy would hold a QPMPC of its own, apart from its owner's copy of it.
-        raise QPError.expected(
-            "GaussNewton",
-            "a copy or a pickle",
-            "its state_dict",
-            "Make a GaussNewton for the copied QPMPC, and load the state_dict into it.",
-        )
+        remedy = "Make a GaussNewton for the copied QPMPC, and load the state_dict into it."
+        raise QPError.expected("GaussNewton", "a copy or a pickle", "its state_dict", remedy)
 
     def _check_parameters(self) -> None:
         """Raise `QPError` if the QPMPC has other parameters than this optimiser."""

@@ -54,7 +54,7 @@ class DeviationPenalty(nn.Module):
         for name, weight in {"c_1": c_1, "c_2": c_2, "c_3": c_3}.items():
             check_number(name, weight, *NONNEGATIVE)
         distance, mask = band_distance(mpc.layout).to(mpc.C_0), torch.full_like(mpc.C_0, c_2)
-        mask[distance > 0], mask[distance < 0] = c_1, c_3
+        mask[distance > 0], mask[distance < 0] = float(c_1), float(c_3)
         self.register_buffer("C_0", mpc.C_0.detach().clone())
         self.register_buffer("C_mask", mask)
 

@@ -88,7 +88,7 @@ class Bounds:
             if value is not None or name in SLACKS:
                 object.__setattr__(self, name, read(name, value))
         if self.held is not None:
-            held = torch.as_tensor(self.held, dtype=torch.bool, device="cpu")
+            held = read_numbers("held", self.held).bool()
             n_mixed = 0 if self.constraints is None else len(self.constraints[0])
             if held.shape != (n_mixed,):
                 want = f"({n_mixed},): one entry per row of constraints"

@@ -72,7 +72,7 @@ class Levels:
         if not any(bounds.action_levels or ()):
             for name, default in DEFAULTS.items():
                 value = getattr(bounds, name)
-                if value is not None and np.any(np.not_equal(value, default)):
+                if value is not None and np.any(np.asarray(value, dtype=object) != default):
                     raise QPError.expected(name, repr(value), "action_levels or u_levels")
             return None
         if layout.blocks:

@@ -64,7 +64,7 @@ class Scheme:
 
     def __post_init__(self) -> None:
         kinds = {"layout": Layout, "model": Model, "cost": Cost, "bounds": Bounds}
-        for name, kind in kinds.items():
+        for name, kind in (kinds | {"constants": Mapping}).items():
             check_kind(name, getattr(self, name), kind)
         check_number("gamma", self.gamma, lambda x: 0 < x <= 1, "a discount factor in (0, 1]")
         object.__setattr__(self, "gamma", float(self.gamma))

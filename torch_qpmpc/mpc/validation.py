@@ -126,7 +126,7 @@ def read_numbers(name: str, value: Any) -> Tensor:
             value = value.copy()  # torch warns of such an array, as of a column of pandas
         # On the CPU: a default device of "meta" would drop the values of lists.
         return torch.as_tensor(value, dtype=torch.float64, device="cpu")
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         tensor = isinstance(value, Tensor)
         got = f"a tensor of {value.dtype} on {value.device}" if tensor else repr(value)
         want = "a tensor, or what torch.as_tensor takes, of real numbers"

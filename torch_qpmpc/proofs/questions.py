@@ -205,7 +205,7 @@ def _worst(
         raise QPError.expected("steps", got, want)
     tables, program = make_tables(mpc), Program()
     start = _known(program, states)
-    question += f" {steps} step{'s' * (steps > 1)}"
+    question += f" {steps} step{'s' * int(steps > 1)}"
     answer = Answer(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
     sizes = positive(np.abs(A) @ states.size, positive(np.abs(b)))
     for branch in _branches(program, tables, start, states.vertices(), plants, steps):
