@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import cvxpy
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -158,6 +159,17 @@ def test_a_side_of_bounds_may_be_none():
     for bounds, sides in cases.items():
         design = qm.LinearMPC(model, 3, Q=1.0, u_bounds=bounds).design
         assert [side.tolist() for side in design.u_bounds] == sides
+
+
+@pytest.mark.parametrize("read", [tuple, np.array, np.float32, torch.tensor, pd.Series])
+def test_pairs_of_bounds_and_prices_are_of_any_numbers(read):
+    pair, price = read([-1.0, 1.0]), np.float32(0.5)
+    options = {"constraints": {"power": ({"u1": 1.0}, pair, price)}, "linear": {"u1": price}}
+    for bounds in (pair, {"u1": pair}):
+        design = qm.LinearMPC(SCALAR, 3, Q=1.0, u_bounds=bounds, **options).design
+        assert [side.tolist() for side in design.u_bounds] == [[-1.0], [1.0]]
+        assert design.constraints["power"] == ({"u1": 1.0}, (-1.0, 1.0), 0.5)
+        assert design.linear == {"u1": 0.5}
 
 
 @refused(

@@ -4,6 +4,7 @@ import copy
 import io
 import itertools
 import pickle
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -602,5 +603,8 @@ def test_assigning_what_the_stages_do_not_share_is_refused(part, index):
 def test_predict_takes_any_array_of_numbers(kind):
     mpc = QPMPC.from_model([[0.9]], [[0.5]], 3, stage_weight=[1.0, 0.1], solver="daqp")
     s = np.array([[1.0], [2.0], [-3.0]])
-    given = mpc.predict(s[::-1].astype(kind)[::-1])
-    np.testing.assert_allclose(given, mpc.predict(s), rtol=1e-6)
+    for given in (s[::-1].astype(kind)[::-1], s.astype(kind)):
+        given.flags.writeable = False
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            np.testing.assert_allclose(mpc.predict(given), mpc.predict(s), rtol=1e-6)

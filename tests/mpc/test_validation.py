@@ -37,8 +37,9 @@ def test_lists_are_read_on_a_default_device_of_meta():
     assert_close(mpc.state_dict(), expected, rtol=0, atol=0)
 
 
-def test_an_array_that_cannot_be_written_is_read_without_a_warning():
-    column = np.ones(2)
+@pytest.mark.parametrize("kind", [">f8", "g", "f4", "i8", "?"])
+def test_an_array_of_any_numbers_that_cannot_be_written_is_read_without_a_warning(kind):
+    column = np.ones(2, kind)
     column.flags.writeable = False
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -585,13 +585,13 @@ def read_prices(
     if linear is not None and not isinstance(linear, Mapping):
         raise QPError.expected("linear", repr(linear), want)
     for name, price in (linear or {}).items():
-        numeric = isinstance(price, int | float) and np.isfinite(price)
+        numeric = isinstance(price, int | float | np.number) and np.isfinite(price)
         if name not in plant.inputs or not (numeric or price in plant.known):
             remedy = f"Pass known={[*plant.known, price]}." * isinstance(price, str)
             raise QPError.expected("linear", f"{{{name!r}: {price!r}}}", want, remedy)
         if not numeric:
             _check_apart("linear", str(price), plant)
-    return dict(linear or {})
+    return {k: x if isinstance(x, str) else float(x) for k, x in (linear or {}).items()}
 
 
 def _check_apart(name: str, signal: str, plant: StateSpace) -> None:
@@ -641,7 +641,7 @@ def read_constraints(name: str, value: Any, names: Sequence[str]) -> dict[str, C
         given = isinstance(own, Sequence) and len(own) in (2, 3) and isinstance(own[0], Mapping)
         weights = read_vector(name, own[0] if given else {}, names, 0.0)
         price = [np.nan, *own[2:]][-1] if given else np.nan
-        priced = isinstance(price, int | float) and not price < 0
+        priced = isinstance(price, int | float | np.number) and not price < 0
         if not (np.isfinite(weights).all() and weights.any() and priced):
             raise QPError.expected(name, f"{key!r}: {own!r}", want, "Prices are >= 0, or inf.")
         (lower,), (upper,) = read_bounds(name, {key: own[1]}, [key])
@@ -681,10 +681,10 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
         if unknown := sorted({*value} - {*names}):
             raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         pairs = [(None, None) if value.get(x) is None else value[x] for x in names]
-        if not all(isinstance(x, Sequence) and len(x) == 2 for x in pairs):
+        if not all(isinstance(x, Collection) and len(x) == 2 for x in pairs):
             raise QPError.expected(name, repr(dict(value)), "pairs (lower, upper) by name")
         value = [*zip(*pairs, strict=True)]
-    if not isinstance(value, Sequence) or len(value) != 2:
+    if not isinstance(value, Collection) or len(value) != 2:
         raise QPError.expected(name, repr(value), "the pair (lower, upper), or pairs by name")
     sides = []
     for i, (side, end) in enumerate(zip(value, (-np.inf, np.inf), strict=True)):

@@ -333,7 +333,7 @@ class QPMPC(nn.Module):
         try:
             x = np.asarray(observation)
             kind = x.dtype if x.dtype in (np.float16, np.float32) else np.float64
-            x = np.ascontiguousarray(x, kind)
+            x = np.array(x, kind, ndmin=1, order="C")  # torch warns of a read-only one
         except (TypeError, ValueError) as error:
             got, want = type(observation).__name__, f"an array of shape (.., {self.n_p})"
             remedy = "Pass the observation alone; env.reset and env.step return more."

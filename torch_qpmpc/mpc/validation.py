@@ -122,8 +122,8 @@ def read_numbers(name: str, value: Any) -> Tensor:
         of_tensor = isinstance(value, Tensor) and (value.is_complex() or value.is_meta)
         if of_tensor or (isinstance(value, np.ndarray) and np.iscomplexobj(value)):
             raise TypeError
-        if isinstance(value, np.ndarray) and not value.flags.writeable:
-            value = value.copy()  # torch warns of such an array, as of a column of pandas
+        if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+            value = np.array(value, dtype=float)  # torch warns of read-only, refuses foreign bytes
         # On the CPU: a default device of "meta" would drop the values of lists.
         return torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
