@@ -73,6 +73,26 @@ def test_what_rounding_leaves_of_a_zero_sets_no_unit():
     assert mpc.policy(s).abs() < 1e-8
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_entries_that_all_but_vanish_set_no_unit(solver, seed):
+    """Mean logarithms made much of what exponentials in costs and models leave."""
+    A, B = [[1.0, 0.1, 0.0], [0.0, 0.9, 0.3], [0.0, 0.0, 0.8]], [[0.0], [0.1], [0.5]]
+    options = {"stage_weight": [1.0, 0.0, 0.0, 0.0], "action_bounds": ([-1.0], [1.0])}
+    mpc, s = QPMPC.from_model(A, B, 20, **options), torch.tensor([[3.0, -1.0, 0.5]]).double()
+    plain, generator = mpc.quadratic_program(), torch.Generator().manual_seed(seed)
+    of_H, of_C = (
+        10 ** (-20 - 180 * torch.rand(x.shape, generator=generator).double())
+        for x in (plain.q, plain.C)
+    )
+    of_C *= torch.rand(of_C.shape, generator=generator) < 0.05
+    noisy = replace(plain, H=plain.H + of_H.diag(), C=plain.C + of_C)
+    solution = solve_qp(noisy, s, solver=solver)
+    assert_close(solution.value, solve_qp(plain, s, solver=solver).value, rtol=1e-6, atol=0)
+    units = Programs.of(*noisy.tensors(), s)[0].prepared.units
+    assert units is not None
+    assert units.length.max() < 100 * units.length.min()
+
+
 @pytest.mark.parametrize("count", [1, FEW])
 @pytest.mark.parametrize("bound", [1e3, 1e6, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound, count):

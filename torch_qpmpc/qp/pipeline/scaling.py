@@ -149,22 +149,23 @@ class Units(NamedTuple):
 def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return units of the entries of z ``(M, n_z)`` that equilibrate H and rows of equations.
 
-    Their logarithms, and those of units of the rows and of the cost, bring those of the entries
-    nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
-    part in its unit.
+    With them, units of the rows and one of the cost, the largest entry of each row and column is
+    near one (Ruiz, 2001): what all but vanishes beside it counts for nothing. A signal's own
+    bounds, which any unit suits, have no part in its unit.
     """
     (M, n, _), r = H.shape, rows.shape[1]
     # The matrices of an MPC scheme are sparse.
     (m, i, j), (k, row, column) = H.nonzero(), rows.nonzero()
     of_cost, of_row = np.log2(np.abs(H[m, i, j])), np.log2(np.abs(rows[k, row, column]))
     of_column = np.concatenate((m * n + j, k * n + column))
+    shared = np.bincount(k * r + row, minlength=M * r)[k * r + row] > 1
     units, by_row, cost = np.zeros((M, n)), np.zeros((M, r)), np.zeros(M)
     for _ in range(PASSES):
-        by_row -= _means(k * r + row, of_row + units[k, column], M * r).reshape(M, r) + by_row
-        cost -= _means(m, of_cost + units[m, i] + units[m, j], M) + cost
-        of_H = of_cost + units[m, i] + units[m, j] + cost[m]
-        both = np.concatenate((of_H, of_row + units[k, column] + by_row[k, row]))
-        units -= _means(of_column, both, M * n).reshape(M, n)
+        by_row -= _largest(k * r + row, of_row + units[k, column], M * r).reshape(M, r) + by_row
+        cost -= _largest(m, of_cost + units[m, i] + units[m, j], M) + cost
+        of_H = (of_cost + units[m, i] + units[m, j] + cost[m]) / 2
+        of_rows = np.where(shared, of_row + units[k, column] + by_row[k, row], -np.inf)
+        units -= _largest(of_column, np.concatenate((of_H, of_rows)), M * n).reshape(M, n)
     return np.exp2(np.round(units))
 
 
@@ -183,10 +184,11 @@ def finite_sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
     return largest
 
 
-def _means(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Return the mean of the values in each of ``count`` groups, zero in empty ones."""
-    sizes = np.bincount(groups, minlength=count)
-    return np.bincount(groups, values, minlength=count) / np.maximum(sizes, 1)
+def _largest(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return the largest of the values in each of ``count`` groups, zero in empty ones."""
+    largest = np.full(count, -np.inf)
+    np.maximum.at(largest, groups, values)
+    return np.where(largest > -np.inf, largest, 0.0)
 
 
 def _apart(sizes: np.ndarray) -> bool:
