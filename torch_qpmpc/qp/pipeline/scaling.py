@@ -15,7 +15,7 @@ their matrices, but whose optima differ by orders of magnitude, do not share a l
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,8 @@ PASSES = 8
 ALIKE = 7
 #: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
 ROUNDING = 2.0**-40
+#: Where entries all but vanish, units of those of z are powers of two no further from one.
+MOST = 25
 
 
 class Units(NamedTuple):
@@ -149,24 +151,38 @@ class Units(NamedTuple):
 def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return units of the entries of z ``(M, n_z)`` that equilibrate H and rows of equations.
 
-    With them, units of the rows and one of the cost, the largest entry of each row and column is
-    near one (Ruiz, 2001): what all but vanishes beside it counts for nothing. A signal's own
-    bounds, which any unit suits, have no part in its unit.
+    Their logarithms, and those of units of the rows and of the cost, bring those of the entries
+    nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
+    part in its unit. Where entries all but vanish, the largest ones are one (Ruiz, 2001).
     """
     (M, n, _), r = H.shape, rows.shape[1]
     # The matrices of an MPC scheme are sparse.
     (m, i, j), (k, row, column) = H.nonzero(), rows.nonzero()
-    of_cost, of_row = np.log2(np.abs(H[m, i, j])), np.log2(np.abs(rows[k, row, column]))
-    of_column = np.concatenate((m * n + j, k * n + column))
-    shared = np.bincount(k * r + row, minlength=M * r)[k * r + row] > 1
-    units, by_row, cost = np.zeros((M, n)), np.zeros((M, r)), np.zeros(M)
+    costs = np.log2(np.abs(H[m, i, j])), m, m * n + i, m * n + j
+    rates = np.log2(np.abs(rows[k, row, column])), k * r + row, k * n + column
+    shared = np.bincount(rates[1], minlength=M * r)[rates[1]] > 1
+    own, start, shape = [x[shared] for x in rates], np.zeros(M * n), (M, n, r)
+    units = _equilibrated(_means, start, costs, rates, shape)[0]
+    of_largest, *scaled = _equilibrated(_largest, units, costs, own, shape)
+    vanishing = (np.concatenate(scaled) <= np.log2(ROUNDING)).nonzero()
+    if len(at := np.concatenate((m, k[shared]))[vanishing]):
+        of_largest = _equilibrated(_largest, start, costs, own, shape)[0].clip(-MOST, MOST)
+        units = np.where(np.isin(np.arange(M * n) // n, at), of_largest, units)
+    return np.exp2(np.round(units.reshape(M, n)))
+
+
+def _equilibrated(
+    typical: Any, units: np.ndarray, costs: Any, rates: Any, shape: Any
+) -> tuple[np.ndarray, ...]:
+    """Return logarithms of units and of the scaled entries: ``typical`` ones are near zero."""
+    (of_cost, m, i, j), (of_rate, row, column), (M, n, r) = costs, rates, shape
+    both, power = np.concatenate((j, column)), 1 + (typical is _largest)
     for _ in range(PASSES):
-        by_row -= _largest(k * r + row, of_row + units[k, column], M * r).reshape(M, r) + by_row
-        cost -= _largest(m, of_cost + units[m, i] + units[m, j], M) + cost
-        of_H = (of_cost + units[m, i] + units[m, j] + cost[m]) / 2
-        of_rows = np.where(shared, of_row + units[k, column] + by_row[k, row], -np.inf)
-        units -= _largest(of_column, np.concatenate((of_H, of_rows)), M * n).reshape(M, n)
-    return np.exp2(np.round(units))
+        by_row = -typical(row, of_rate + units[column], M * r)
+        cost = -typical(m, of_cost + units[i] + units[j], M)
+        scaled = of_cost + units[i] + units[j] + cost[m], of_rate + units[column] + by_row[row]
+        units = units - typical(both, np.concatenate((scaled[0] / power, scaled[1])), M * n)
+    return units, *scaled
 
 
 def column_sizes(matrices: np.ndarray) -> np.ndarray:
@@ -184,11 +200,17 @@ def finite_sizes(vectors: np.ndarray, group: np.ndarray, M: int) -> np.ndarray:
     return largest
 
 
+def _means(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Return the mean of the values in each of ``count`` groups, zero in empty ones."""
+    sizes = np.bincount(groups, minlength=count)
+    return np.bincount(groups, values, minlength=count) / np.maximum(sizes, 1)
+
+
 def _largest(groups: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     """Return the largest of the values in each of ``count`` groups, zero in empty ones."""
     largest = np.full(count, -np.inf)
     np.maximum.at(largest, groups, values)
-    return np.where(largest > -np.inf, largest, 0.0)
+    return np.where(np.isfinite(largest), largest, 0.0)
 
 
 def _apart(sizes: np.ndarray) -> bool:
