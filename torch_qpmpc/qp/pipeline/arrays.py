@@ -70,10 +70,6 @@ class SoftQPs(NamedTuple):
     u: Array
     w: Array
 
-    def take(self, index: Array) -> SoftQPs:
-        """Return the problems at ``index``, with the same matrices."""
-        return SoftQPs(self.H, self.G, *(x[index] for x in self[2:]))
-
     def in_own_units(self, solve: Callable[[SoftQPs], BackendSolution]) -> BackendSolution:
         """Solve QPs whose optimum may be far from zero in units of their own, powers of two.
 
@@ -105,11 +101,6 @@ class BackendSolution(NamedTuple):
     v: Array
     lam: Array
     iterations: Array
-
-    def put(self, index: Array, other: BackendSolution) -> None:
-        """Replace the solutions at ``index``."""
-        for own, new in zip(self, other, strict=True):
-            own[index] = new
 
 
 class BatchSolution(NamedTuple):

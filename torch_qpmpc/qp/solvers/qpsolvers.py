@@ -30,22 +30,15 @@ def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
     form = SplitSlack.of(qps)
     v, lam = np.zeros_like(qps.g), np.zeros_like(qps.l)
     sparse = name in qpsolvers.sparse_solvers
-    for i, m in enumerate(qps.group):
-        lower, upper = form.bounds(qps.l[i], qps.u[i], qps.w[i])
-        rows = form.rows[m][: form.n_rows]
-        has_upper = np.flatnonzero(np.isfinite(upper[: form.n_rows]))
-        has_lower = np.flatnonzero(np.isfinite(lower[: form.n_rows]))
-        one_sided = scipy.sparse.csc_matrix(
-            scipy.sparse.vstack([rows[has_upper], -rows[has_lower]])
-        )
-        box = np.full(form.n_v, np.inf)
+    for i, (m, g, lower, upper) in enumerate(zip(qps.group, *form[2:], strict=True)):
+        has_upper, has_lower = (np.flatnonzero(np.isfinite(x)) for x in (upper, lower))
+        sides = [form.rows[m][has_upper], -form.rows[m][has_lower]]
+        one_sided = scipy.sparse.vstack(sides, format="csc")
         problem = qpsolvers.Problem(
             form.H[m] if sparse else form.H[m].toarray(),
-            form.gradient(qps.g[i], qps.w[i]),
+            g,
             one_sided if sparse else one_sided.toarray(),
             np.concatenate([upper[has_upper], -lower[has_lower]]),
-            lb=np.concatenate([-box, lower[form.n_rows :]]),
-            ub=np.concatenate([box, upper[form.n_rows :]]),
         )
         try:
             solution = qpsolvers.solve_problem(problem, solver=name)
@@ -53,7 +46,8 @@ def solve(qps: SoftQPs, *, name: str) -> BackendSolution:
             continue  # Its zeros are rejected by the certificate.
         if solution.x is None or solution.z is None:
             continue
-        v[i] = solution.x[: form.n_v]
-        lam[i, has_upper] += solution.z[: len(has_upper)]
-        lam[i, has_lower] -= solution.z[len(has_upper) :]
+        force = np.zeros(len(lower))
+        force[has_upper] += solution.z[: len(has_upper)]
+        force[has_lower] -= solution.z[len(has_upper) :]
+        v[i], lam[i] = solution.x[: v.shape[1]], force[: lam.shape[1]]
     return BackendSolution(v, lam, np.zeros(len(v), dtype=np.int64))
