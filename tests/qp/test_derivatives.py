@@ -9,13 +9,14 @@ from torch.func import hessian, jacfwd, jacrev, vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states
-from torch_qpmpc import QuadraticProgram, solve_qp
+from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
 from torch_qpmpc.qp import kkt
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solution import saturated_rows
 
 OPERANDS = (*EVENT_SHAPES, "fixed")
 PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
+SOLVERS = pytest.mark.parametrize("solver", ["proxqp", "daqp", "torch"])
 KINDS = ("inside", "at_lower", "at_upper", "below", "above", "no_upper", "free")
 
 
@@ -84,6 +85,33 @@ def test_policy_gradient_in_the_state_on_and_off_the_bounds():
     assert (~pinned).any()
     assert slope[pinned].max() < 1e-9
     assert slope[~pinned].min() > 1e-6
+
+
+@SOLVERS
+@pytest.mark.parametrize("bound", [None, 1.0], ids=["free states", "soft states"])
+@pytest.mark.parametrize(("a", "b", "N"), [(3.0, 1.0, 15), (10.0, 1.0, 10), (3.65, 10.0, 15)])
+def test_an_action_at_its_bound_has_no_slope_however_unstable_the_model(a, b, N, bound, solver):
+    """The multipliers differ by factors of 1e6 to 1e18; soft states reach theirs of 100."""
+    options: dict[str, Any] = {"state_bounds": ([-bound], [bound])} if bound else {}
+    options |= {"stage_weight": [1.0, 0.1], "action_bounds": ([-1.0], [1.0]), "gamma": 1.0}
+    mpc = QPMPC.from_model([[a]], [[b]], N, solver=solver, **options)
+    s = vector(2.0 * b / (a - 1))
+    plan = mpc.solve(s).z.detach()[1::2]
+    assert_close(plan, -torch.ones(N).double(), rtol=0, atol=0.02)
+    slope = torch.autograd.functional.jacobian(lambda s: mpc.solve(s).z[1::2], s)
+    assert_close(slope, torch.zeros(N, 1).double(), rtol=0, atol=1e-9)
+
+
+@SOLVERS
+@pytest.mark.parametrize("b", [1.0, 10.0])
+def test_an_unstable_plan_has_the_slope_of_its_free_actions(b, solver):
+    """The first actions are at their bound, and the policy is affine in s nearby."""
+    options: dict[str, Any] = {"action_bounds": ([-1.0], [1.0]), "gamma": 1.0, "solver": solver}
+    mpc = QPMPC.from_model([[2.0]], [[b]], 20, stage_weight=[1.0, 0.1], **options)
+    s, step = vector(0.99 * b), 1e-4
+    slope = torch.autograd.functional.jacobian(lambda s: mpc.solve(s).z[1::2], s)
+    ends = [mpc.solve(s + sign * step).z[1::2].detach() for sign in (1, -1)]
+    assert_close(slope[:, 0], (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_kink_the_gradient_is_one_of_the_one_sided_derivatives():
@@ -228,7 +256,6 @@ def assert_derivatives_at_the_origin(program: Family, solver: str) -> None:
 
 
 ROW = normal(1, 5, seed=2)
-SOLVERS = pytest.mark.parametrize("solver", ["proxqp", "daqp", "torch"])
 
 
 @SOLVERS

@@ -18,9 +18,10 @@ from torch_qpmpc.qp.kernels import linalg
 from torch_qpmpc.qp.kernels.active_set import hold
 from torch_qpmpc.qp.kernels.batched import largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
-from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
+from torch_qpmpc.qp.pipeline.condensing import eliminate
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
-from torch_qpmpc.qp.solution import active_rows
+from torch_qpmpc.qp.solution import ACTIVE_FRACTION, active_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
 #: The Schur complement's solution is accepted with a relative residual up to this, ..
@@ -33,6 +34,8 @@ FLAT = 1e-14
 AT_BOUND = TOLERANCE
 #: Unit normals that differ by at most this are parallel: data in float32 are no more accurate.
 PARALLEL = 1e-6
+#: Rounding errors grow by more than this along an unstable model.
+GROWTH = 1e3
 #: Event dimensions of the operator's tensors: four gradients; z, lam, status; H, .., fixed.
 KKT_NDIMS = (1, 1, 1, 1, 1, 1, 0, *NDIMS, 1)
 
@@ -89,15 +92,18 @@ def _solve_in_units(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
     return p * (z / cost), r / equalities, t / rows, u / fixed
 
 
-def _solve_kkt(
-    programs: Programs, grad_z, grad_lam, grad_chi, grad_xi, z, lam
-) -> tuple[Tensor, ...]:
+def _solve_kkt(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
+    grad_z, grad_lam, grad_chi, grad_xi, z, lam = vectors
     n_f, theta = programs.n_f, programs.prepared.theta
     group, H, C, G = map(to_tensor, (programs.group, theta.H, theta.C, theta.G))
     condensed = programs.prepared.condensed(n_f)
     T, H_y, G_y = map(to_tensor, (condensed.T, condensed.H, condensed.G))
     factors = *condensed[1:3], condensed.spans[4], programs.group
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
+    rows = programs.prepared.sizes(n_f).bounds
+    alone = active.numpy()[:, rows[rows >= 0]]
+    if alone.any() and np.abs(eliminate(theta.C, n_f, 0.0).T).max() > GROWTH:
+        return _solve_pinned(programs, rows[rows >= 0], alone, *vectors)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)
     if grad_chi.any() or grad_xi.any():
@@ -115,18 +121,44 @@ def _solve_kkt(
     return p_z, r, t, u
 
 
+def _solve_pinned(
+    programs: Programs, rows: np.ndarray, alone: np.ndarray, *vectors: Tensor
+) -> tuple[Tensor, ...]:
+    """Do as `_solve_kkt` with equations for the rows that hold an entry of z ``alone``, ``(B, k)``.
+
+    They leave no rounding errors of these entries, which would grow along an unstable model.
+    """
+    p, t, r, u = map(torch.zeros_like, vectors[:4])
+    masks, which = np.unique(alone, axis=0, return_inverse=True)
+    for k, mask in enumerate(masks):
+        index, own, n = np.flatnonzero(which.reshape(-1) == k), rows[mask], mask.sum()
+        part = programs.take(index)
+        theta, M = part.theta, max(map(len, part.theta[1:3]))
+        C = [x.repeat(M // len(x), 0) for x in (theta.G[:, own], theta.C)]
+        theta = theta._replace(C=np.hstack(C), b=np.pad(theta.b, ((0, 0), (n, 0))))
+        inner = Programs(Prepared(theta, part.group, part.n_f), part.group, part.fixed)
+        of_z, of_lam, of_chi, *rest = (x[index] for x in vectors)
+        of_C = torch.cat((of_lam[:, own], of_chi), dim=1)
+        p[index], of_C, t[index], u[index] = _solve_kkt(inner, of_z, of_lam, of_C, *rest)
+        t[index[:, None], own], r[index] = of_C[:, :n], of_C[:, n:]
+    return p, r, t, u
+
+
 def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     """Return the mask of rows y = G z that stay at a bound if the data change, ``(B, n_g)``.
 
-    They are those of `active_rows`, and those that `implied_equalities` adds; rows without a free
-    variable have no part in the KKT system.
+    They are those of `active_rows`, those at a bound with a multiplier beyond rounding, and those
+    that `implied_equalities` adds; rows without a free variable have no part in the KKT system.
     """
     lb, ub, w = map(to_tensor, programs.theta[6:9])
     held, saturated = active_rows(lam, lb, ub, w)
     condensed = programs.prepared.condensed(programs.n_f)
     entering = to_tensor(condensed.enters[:, programs.n_f :].any(-1))
-    near, free = AT_BOUND * (1 + y.abs()), ~(held | saturated) & entering
-    held &= entering
+    near, beyond = AT_BOUND * (1 + y.abs()), torch.maximum(lb - y, y - ub)
+    saturated |= w.isfinite() & (lam != 0) & (beyond > near)
+    held |= (lam.abs() > ACTIVE_FRACTION) & (beyond > -near.maximum(lam.abs()))
+    held &= entering & ~saturated
+    free = ~(held | saturated) & entering
     lower, upper = free & (y - lb <= near), free & (ub - y <= near)
     if (weak := (lower | upper).any(-1)).any():
         G = condensed.G[:, :, programs.n_f :]
@@ -224,16 +256,13 @@ def _solve_dense(
 
     Of all v and t it returns those of least norm.
     """
-    rows = active.any(dim=0).nonzero().squeeze(-1)
-    A = G[:, rows].masked_fill(~active[:, rows].unsqueeze(-1), 0)
+    A = G.masked_fill(~active.unsqueeze(-1), 0)
     size = torch.linalg.vector_norm(A, dim=-1)
     size = size.where(size > 0, 1)
     of_A, of_H, _ = null_space_inverses(H, A / size.unsqueeze(-1), PARALLEL, FLAT)
-    v = times(of_A, right_t[:, rows] / size)
+    v = times(of_A, right_t / size)
     v = v + times(of_H, right_v - times(H, v))
-    t = torch.zeros_like(right_t)
-    t[:, rows] = times(of_A.mT, right_v - times(H, v)) / size
-    return v, t
+    return v, times(of_A.mT, right_v - times(H, v)) / size
 
 
 NAMES = ("grad_z", "grad_lam", "grad_chi", "grad_xi", "z", "lam", "status", *EVENT_SHAPES, "fixed")
