@@ -8,8 +8,10 @@ import pytest
 import torch
 
 import torch_qpmpc as qm
+from torch_qpmpc.control import linear_loop
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.state_space import read_model
+from torch_qpmpc.export.tables import make_tables
 
 LAG = ([[0.9]], [[0.5]])
 INTEGRATOR = ([[1.0, 0.1], [0.0, 0.8]], [[0.0], [1.0]], [[1.0, 0.0]])
@@ -142,8 +144,15 @@ def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
     assert noise is not None
     assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
     held = 1 + (0.9 * 0.02) ** 2 / (1 - 0.9**2)
-    held_loop = LinearLoop.of(mpc, looped.observer, 0.0)
+    held_loop = LinearLoop.of(mpc, looped.observer, held=True)
     assert held_loop.cost_of_noise(mpc.design, noise) == pytest.approx(held)
+
+
+def test_a_review_makes_the_tables_of_a_plan_and_its_target_once(monkeypatch):
+    looped, made_of = controller(NOISY)[0], []
+    monkeypatch.setattr(linear_loop, "make_tables", lambda x: made_of.append(x) or make_tables(x))
+    assert "noise" in [finding.name for finding in looped.review(r=[0.0]).findings]
+    assert made_of == [looped.mpc.plan, looped.mpc.targets]
 
 
 def test_a_filter_that_takes_noise_for_disturbances_is_named_and_its_remedy_mends_it():

@@ -38,11 +38,12 @@ class LinearLoop:
     units: Array
 
     @classmethod
-    def of(cls, mpc: LinearMPC, observer: Observer, share: float = 1.0) -> LinearLoop:
-        """Return the loop of an MPC, with a ``share`` of its gains, and an observer."""
-        K_e, K_u, K_r = (share * K for K in _gains(mpc))
+    def of(cls, mpc: LinearMPC, observer: Observer, held: bool = False) -> LinearLoop:
+        """Return the loop of an observer and an MPC, or of inputs that are ``held``."""
         plant, F, G, L = mpc.design.plant, observer.F, observer.G, observer.L
         m, corrected = plant.B.shape[1], np.eye(len(F)) - L @ observer.H
+        zeros = (np.zeros((m, n)) for n in (len(F), m, len(plant.C)))
+        K_e, K_u, K_r = zeros if held else _gains(mpc)
         # u = C_c [e; u_last] + D_c y + K_r r, and e+ = F (corrected e + L y) + G u.
         C_c, D_c = np.hstack((K_e @ corrected, K_u)), K_e @ L
         A_c = np.vstack((np.hstack((F @ corrected, np.zeros((len(F), m)))) + G @ C_c, C_c))

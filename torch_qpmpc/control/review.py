@@ -364,7 +364,7 @@ def _margin(loop: LinearLoop, law: Law) -> Finding:
 def _noise(loop: LinearLoop, law: Law, noise: tuple[Array, Array]) -> Finding:
     """Under the identified noise the loop costs hardly more than a constant input does."""
     design, cost = law.design, loop.cost_of_noise(law.design, noise)
-    nothing = LinearLoop.of(law.mpc, law.observer, 0.0).cost_of_noise(design, noise)
+    nothing = LinearLoop.of(law.mpc, law.observer, held=True).cost_of_noise(design, noise)
     ok = bool(cost <= NOISY * nothing + OFFSET * design.typical)
     text = f"Under the log's noise a step costs {cost:.4g}, and {nothing:.4g} with constant inputs."
     remedy = _slower("drift", design.disturbances.names, law.drift / 10)

@@ -83,11 +83,10 @@ def simulate(
     options["near"] = 1.0 if u is None else FAINT
     loop = closed_loop(law, memory, plant, steps, r, begun.u, law.policy(begun), **options)
     signals, moves, following = zip(*loop, strict=True)
-    y, r, d = ([getattr(x, name) for x in signals] for name in ("y", "r", "known"))
-    y, r = [*y, following[-1]], [*(x[0] for x in r), r[-1][1]]
-    inputs, u_s = [move.u for move in moves], [np.atleast_2d(x.target.u)[0] for x in moves]
-    y, r, inputs, d, u_s = map(np.array, (y, r, inputs, [x[0] for x in d], u_s))
-    return Run(law.design, y, r, inputs, d, u_s, begun.u)
+    y, r, d = map(np.array, zip(*signals, strict=True))
+    y, r = np.vstack((y, following[-1])), np.vstack((r[:, 0], r[-1, 1]))
+    u, u_s = np.array([(x.u, np.atleast_2d(x.target.u)[0]) for x in moves]).swapaxes(0, 1)
+    return Run(law.design, y, r, u, d[:, 0], u_s, begun.u)
 
 
 def closed_loop(
