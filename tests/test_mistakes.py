@@ -109,7 +109,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("3 of 3 QPs have no certified solution. 3 INVALID_DATA", lambda: qm.solve_qp(qp, fixed * nan)),
     ("n_x: got True, expected a whole number >= 1.", M(n_x=True)),
     ("gamma: got nan, expected a discount factor in (0, 1].", M(gamma=nan)),
-    ("A, B: got shapes (2,) and (2, 1), expected matrices (n_x, n_x) and (n_x,", M(A=ones(2))),
+    ("A, B: got shapes (2,) and (2, 1), expected (n_x, n_x) and (n_x,", M(A=ones(2))),
     ("A, B: got shapes (2, 2) and (1, 2), expected (n_x, n_x) and (n_x, n_u)", M(B=ones(1, 2))),
     ("A: got [[1.0, 0.0], [1.0]], expected a tensor, or what", M(A=[[1.0, 0.0], [1.0]])),
     ("A: got a torch.sparse_coo tensor, which is sparse, expected a", M(A=eye(2).to_sparse())),

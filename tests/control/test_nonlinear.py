@@ -145,6 +145,26 @@ def test_a_run_starts_at_rest_and_ends_at_the_set_point():
     assert_allclose(run.y[-1], [2.5, 30.0], atol=1e-2)
 
 
+def upright(x: Tensor, u: Tensor) -> Tensor:
+    """Return the slopes of a pendulum's angle and speed about its upper rest."""
+    return torch.stack((x[..., 1], 9.81 * x[..., 0].sin() + u[..., 0] - 0.1 * x[..., 1]), -1)
+
+
+@pytest.mark.parametrize(("angle", "status"), [(0.0, 0), (1.5, 2)])
+def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(angle, status):
+    f, bounds = qm.RungeKutta(upright, 0.1), ([-1.0, -0.5], [0.9, 1.2])
+    options: Any = {"u_bounds": (-14, 14), "y_bounds": bounds, "disturbances": {"y1": "u1"}}
+    options |= {"Q": [1.0, 0.0], "dR": 0.01, "y_slack": np.inf}
+    own = qm.Controller(qm.LinearMPC((f, [0.0, 0.0], [0.0]), 20, **options))
+    x = torch.tensor([angle, 0.0]).double()
+    own.reset(y=x.numpy(), u=[0.0])
+    for _ in range(1 if status else 40):
+        x = f(x, torch.from_numpy(own.step(x.numpy(), r=[1.1, 0.0])))
+        assert own.status == status
+        assert status or (x <= torch.tensor(bounds[1]).double() + 1e-3).all()
+    assert status or abs(x[0] - 0.9) < 1e-3
+
+
 def test_a_run_from_a_state_where_the_model_has_no_slope_says_how_to_start():
     model = lambda x, u: x + 0.1 * (u - x.sqrt()), [1.0], [1.0]  # at rest with zero: empty
     own = qm.Controller(qm.LinearMPC(model, 5, Q=1.0, dR=0.1, u_bounds=(0.0, 2.0)))

@@ -109,7 +109,7 @@ def test_an_unstable_plan_has_the_slope_of_its_free_actions(b, solver):
     options: dict[str, Any] = {"action_bounds": ([-1.0], [1.0]), "gamma": 1.0, "solver": solver}
     mpc = QPMPC.from_model([[2.0]], [[b]], 20, stage_weight=[1.0, 0.1], **options)
     s, step = vector(0.99 * b), 1e-4
-    slope = torch.autograd.functional.jacobian(lambda s: mpc.solve(s).z[1::2], s)
+    slope: Any = torch.autograd.functional.jacobian(lambda s: mpc.solve(s).z[1::2], s)
     ends = [mpc.solve(s + sign * step).z[1::2].detach() for sign in (1, -1)]
     assert_close(slope[:, 0], (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-6)
 

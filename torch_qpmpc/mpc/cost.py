@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,12 +92,10 @@ class Cost:
         if self.hessian == "diagonal" or tuple(W.shape) not in shapes:
             W = W[-1] if W.ndim > 1 else W
         elif self.q is None:
-            try:
+            with suppress(QPError):  # the stage's weight is always one
                 P = terminal_riccati(A, B, W, gamma, layout)
                 check_weight("terminal_weight", P, diagonal=False, n_d=len(P) - n_x)
                 return P
-            except QPError:
-                pass  # the stage's weight is always one
         if W.ndim == 2:
             size = len(W) - layout.n_u
             return W[:size, :size]

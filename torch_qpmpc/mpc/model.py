@@ -51,11 +51,9 @@ class Model:
         if self.A is None or self.B is None:
             return
         A, B = tuple(self.A.shape), tuple(self.B.shape)
-        got = f"shapes {A} and {B}"
-        if len(A) < 2 or len(B) < 2:
-            raise QPError.expected("A, B", got, "matrices (n_x, n_x) and (n_x, n_u)")
-        if not A[-2] == A[-1] == B[-2]:
-            raise QPError.expected("A, B", got, "(n_x, n_x) and (n_x, n_u)")
+        if len(A) < 2 or len(B) < 2 or not A[-2] == A[-1] == B[-2]:
+            got, want = f"shapes {A} and {B}", "(n_x, n_x) and (n_x, n_u)"
+            raise QPError.expected("A, B", got, want)
 
     def layout(self, horizon: int) -> Layout:
         """Return the sizes that A, B and E have with ``horizon`` stages.

@@ -47,8 +47,8 @@ FIRST, LEAST, MOST, CHANGE = 1e-2, 1e-9, 1e4, 4.0
 #: A converged plan's step, and a rise of the cost that is rounding, relatively; too large a state.
 SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
 #: The price of a hard row's violation: relative to its largest multiplier, and before there is one
-#: to the cost of a violation by the row's bound.
-PRICE, FIRM = 2.0, 0.3
+#: to the cost of a violation by the row's bound; and the share of it that infeasible QPs may leave.
+PRICE, FIRM, SLIP = 2.0, 0.3, 1e-3
 #: The least eigenvalue of a definite Hessian, relatively.
 DEFINITE = 1e-9
 #: The parts of a `QPSolution` besides its QP.
@@ -181,8 +181,7 @@ class SequentialQP(nn.Module):
         self, d: Tensor, x: Tensor, u: Tensor, *, f: Callable[..., Any] | None = None
     ) -> tuple[Tensor, Tensor | None]:
         """Return the next x, and the stage cost if there is one, of the dynamics or an equal f."""
-        f = f or self.dynamics
-        out = f(x, u, d) if self.layout.n_d else f(x, u)
+        out = (f or self.dynamics)(*(x, u, d)[: 2 + bool(self.layout.n_d)])
         return out if isinstance(out, tuple) else (out, None)
 
     def outputs(self, w: Tensor) -> Tensor:
@@ -343,7 +342,7 @@ class SequentialQP(nn.Module):
         far = ~(z.abs() < OVERFLOW).all(1)
         z[far, n_p:], costs[far] = 0.0, torch.inf
         pull, parts = fixed.new_full((B,), FIRST), []
-        converged, done = torch.zeros(2, B, dtype=torch.bool)
+        bent, (converged, done) = torch.zeros_like(hard), torch.zeros(2, B, dtype=torch.bool)
         for _ in range(self.iterations):
             if not len(todo := (~done).nonzero().squeeze(1)) and parts:
                 break
@@ -356,6 +355,10 @@ class SequentialQP(nn.Module):
             near.q.sub_(size * z[todo])
             near.c.add_((size * z[todo] ** 2).sum(-1) / 2)
             solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
+            bent[todo] = stuck = (~solution.solved).unsqueeze(1) & hard[todo]
+            if stuck.any():  # along a plan, rows may contradict each other that others keep
+                near = replace(near, w=torch.where(stuck, price[todo], near.w), check_values=False)
+                solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
             own = [getattr(solution, name) for name in PARTS]
             parts = parts or [x.new_empty(B, *x.shape[1:]) for x in own]
             for part, x in zip(parts, own, strict=True):
@@ -383,6 +386,9 @@ class SequentialQP(nn.Module):
         parts[0][left] = merit(left, z[left].unsqueeze(1), costs[left].unsqueeze(1))[:, 0]
         parts[1][left] = z[left]
         parts[5][left[parts[0][left].isinf()]] = int(Status.INVALID_DATA)
+        y = times(qp.G, parts[1])
+        over = bent & (torch.maximum(qp.lb - y, y - qp.ub) > SLIP * bound)
+        parts[5][over.any(1) & (parts[5] == 0)] = int(Status.INFEASIBLE)
         return u, tuple(parts), converged
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:

@@ -88,7 +88,11 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     """
     v, cost = v.detach().double(), cost.detach().double()
     n = v.shape[1]
-    middle, size = _middle(v), v.std(0, correction=0)
+    distance = (v - v.median(0).values).abs()
+    typical = distance.median(0).values
+    # The row nearest to the median, where the linear relations of columns hold.
+    middle = v[(distance / torch.where(typical > 0, typical, 1.0)).square().sum(1).argmin()]
+    size = v.std(0, correction=0)
     scale = torch.where(size > 1e-12 * v.abs().amax(0), 1 / size, 0.0)
     unit = cost.abs().amax().clamp(min=torch.finfo(cost.dtype).tiny)
     rows, columns = torch.triu_indices(n, n)
@@ -101,13 +105,6 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     fitted = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
     R2 = _adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows))
     return StageCost(fitted.W, fitted.q, fitted.c, R2)
-
-
-def _middle(v: Tensor) -> Tensor:
-    """Return the row nearest to the median, where the linear relations of columns hold."""
-    distance = (v - v.median(0).values).abs()
-    size = distance.median(0).values
-    return v[(distance / torch.where(size > 0, size, 1.0)).square().sum(1).argmin()]
 
 
 def _adjusted_R2(cost: Tensor, error: Tensor, coefficients: int) -> float:
