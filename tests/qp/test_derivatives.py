@@ -103,6 +103,19 @@ def test_an_action_at_its_bound_has_no_slope_however_unstable_the_model(a, b, N,
 
 
 @SOLVERS
+def test_soft_rows_whose_multipliers_are_rounding_beside_others_are_not_held(solver):
+    A = [[-8.46, 0.36, -2.15], [-3.67, 2.0, 1.03], [-0.18, -2.12, -3.71]]
+    B, weights = [[-1.34], [-0.25], [-0.13]], [0.305, 0.113, 0.382, 7.14]
+    bounds: Any = {"state_bounds": ([-1.0] * 3, [2.0] * 3), "action_bounds": ([-1.0], [1.0])}
+    bounds |= {"terminal_weight": [21.4, 1.05, 0.169], "gamma": 1.0, "solver": solver}
+    mpc = QPMPC.from_model(A, B, 11, stage_weight=weights, **bounds)
+    s = vector(-1.526, -0.342, 0.357)
+    slope: Any = torch.autograd.functional.jacobian(lambda s: mpc.solve(s).z, s)
+    assert slope.isfinite().all()
+    assert (slope[3].abs() < 1e-9).all()  # u_0 is at its bound
+
+
+@SOLVERS
 @pytest.mark.parametrize("b", [1.0, 10.0])
 def test_an_unstable_plan_has_the_slope_of_its_free_actions(b, solver):
     """The first actions are at their bound, and the policy is affine in s nearby."""

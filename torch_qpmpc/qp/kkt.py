@@ -101,7 +101,7 @@ def _solve_kkt(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
     factors = *condensed[1:3], condensed.spans[4], programs.group
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     rows = programs.prepared.sizes(n_f).bounds
-    alone = active.numpy()[:, rows[rows >= 0]]
+    alone = active.numpy()[:, rows[rows >= 0]] & (not condensed.deficient)
     if alone.any() and np.abs(eliminate(theta.C, n_f, 0.0).T).max() > GROWTH:
         return _solve_pinned(programs, rows[rows >= 0], alone, *vectors)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
@@ -156,7 +156,8 @@ def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
     entering = to_tensor(condensed.enters[:, programs.n_f :].any(-1))
     near, beyond = AT_BOUND * (1 + y.abs()), torch.maximum(lb - y, y - ub)
     saturated |= w.isfinite() & (lam != 0) & (beyond > near)
-    held |= (lam.abs() > ACTIVE_FRACTION) & (beyond > -near.maximum(lam.abs()))
+    most = near.maximum(torch.where(w.isinf(), lam.abs(), 0))  # soft lam may be rounding
+    held |= (lam.abs() > ACTIVE_FRACTION) & (beyond > -most)
     held &= entering & ~saturated
     free = ~(held | saturated) & entering
     lower, upper = free & (y - lb <= near), free & (ub - y <= near)
