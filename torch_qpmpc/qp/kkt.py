@@ -19,7 +19,6 @@ from torch_qpmpc.qp.kernels.active_set import hold
 from torch_qpmpc.qp.kernels.batched import largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
-from torch_qpmpc.qp.pipeline.condensing import eliminate
 from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
 from torch_qpmpc.qp.solution import ACTIVE_FRACTION, active_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
@@ -102,7 +101,7 @@ def _solve_kkt(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
     active = _rows_at_bounds(programs, multiply(G, group, z), lam)
     rows = programs.prepared.sizes(n_f).bounds
     alone = active.numpy()[:, rows[rows >= 0]] & (not condensed.deficient)
-    if alone.any() and np.abs(eliminate(theta.C, n_f, 0.0).T).max() > GROWTH:
+    if alone.any() and programs.prepared.growth(n_f) > GROWTH:
         return _solve_pinned(programs, rows[rows >= 0], alone, *vectors)
     T_f, T = T[:, :, :n_f], T[:, :, n_f:]
     right, right_t, particular = grad_z, grad_lam, torch.zeros_like(z)

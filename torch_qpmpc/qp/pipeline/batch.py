@@ -123,6 +123,11 @@ class Prepared:
         return None if surely or (mask := condensing.convex(self.reduced(n_f).H)).all() else mask
 
     @kept
+    def growth(self, n_f: int) -> float:
+        """Return the largest change of an entry of z by one of the others, by C z = b."""
+        return np.abs(condensing.eliminate(self.theta.C, n_f, 0.0).T).max(initial=0.0)
+
+    @kept
     def sizes(self, n_f: int) -> Sizes:
         """Return the `Sizes` of the reduced QPs."""
         return condensing.sizes(self.condensed(n_f), self.theta, n_f)
