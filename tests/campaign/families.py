@@ -414,6 +414,20 @@ def unstable_model(draw: Draw, count: int) -> Case:
     return solvable(draw.known(count, n_z=n_z, n_f=n_f, matrices=(), **options))
 
 
+def vanishing_entries(draw: Draw, count: int) -> Case:
+    """A stable model and a cost whose entries fall to 1e-200, as those with exponentials do."""
+    plant = Plant.of(draw)
+    plant = replace(plant, A=plant.A / (1.01 * torch.linalg.eigvals(plant.A).abs().max()))
+    C, n_z = plant.C, plant.C.shape[1]
+    low = torch.where(plant.states, draw.choice([-200.0, -40.0, -12.0]), -3.0)
+    H = torch.diag(10 ** (low * draw.powers(0, 1, n_z).log10()))
+    C = C + draw.powers(-200, -20, *C.shape) * (draw.powers(0, 1, *C.shape) < 1.05)
+    hard = ("inside", "at_upper", "at_lower", "inside")
+    soft, G = draw.rows(SOFT_ROWS, n_z - 4, n_z - 4), torch.eye(n_z).double()
+    options = {"H": H, "C": C, "G": G, "soft": soft, "hard": hard}
+    return solvable(draw.known(count, n_z=n_z, n_f=len(plant.A), matrices=(), **options))
+
+
 def runaway_prediction(draw: Draw, count: int) -> Case:
     """A linear MPC scheme whose states grow although the actions are at their bounds.
 
@@ -510,6 +524,7 @@ FAMILIES: dict[str, Callable[[Draw, int], Case]] = {
         after_training,
         parallel_rows,
         unstable_model,
+        vanishing_entries,
         runaway_prediction,
         hopeless_plant,
         *prefix.FAMILIES,
