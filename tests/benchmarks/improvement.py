@@ -117,7 +117,7 @@ def median_costs(runs: Any, names: Sequence[str]) -> list[str]:
 def comparison(rows: Any) -> str:
     """Format J of Q-learning and of what it is compared with, and the seeds on which it is less."""
     lines, shown = [], [name for name in COSTS if name != "true model"]
-    for case in dict.fromkeys((*CASES, *rows["case"])):  # rows of cases that have left, too
+    for case in CASES:
         runs = rows[rows["case"] == case]
         if not len(runs):
             continue
