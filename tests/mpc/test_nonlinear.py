@@ -329,6 +329,22 @@ def test_a_state_from_which_every_plan_leaves_the_region_of_the_dynamics_has_no_
         made(dynamics=limited, learn=()).predict([0.95, 3.0])
 
 
+def test_a_value_of_a_cost_without_curvature_is_that_of_its_plan():
+    """With H = 0 no step had a cost, and the first one counted as none: converged, V of an LP."""
+
+    def dynamics(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return x + u, (x[..., 0] + u[..., 0] - 1).abs() + 0.05 * u[..., 0]
+
+    options = {"stage_weight": [0.0, 0.0], "action_bounds": ([-2.0], [2.0]), "gamma": 1.0}
+    mpc = QPMPC.of(1, 1, 3, dynamics=dynamics, **options)
+    x, cost = torch.tensor([[-3.0], [0.3], [4.0]]).double(), 0.0
+    solution = mpc.solve(x)
+    for u in solution.plan.unbind(-2):
+        x, stage = dynamics(x, u)
+        cost = cost + stage
+    assert_close(solution.value, cost, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("dynamics", [bent, lambda x, u: (bent(x, u), (x**4).sum(-1))])
 def test_a_state_of_nan_has_no_plan_and_no_part_in_gradients(dynamics):
     options = {"stage_weight": [1.0, 0.1], "on_failure": "mask", "solver": "daqp"}

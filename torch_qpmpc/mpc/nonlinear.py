@@ -332,12 +332,9 @@ class SequentialQP(nn.Module):
             tries[:, :, 0] = fixed[:, None, n_p:]
         tries = tries[:, :, self.held]
         z, costs = self.simulated(p.unsqueeze(1), tries)
-        cost = merit(every, z, costs)
-        if hard.any():
-            least = cost.amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
-            price = torch.where(hard, FIRM * least / bound, price)
-            cost = merit(every, z, costs)
-        best = cost.argmin(1)
+        least = merit(every, z, costs).amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
+        price = torch.where(hard, FIRM * least / bound, price)
+        best = merit(every, z, costs).argmin(1)
         u, z, costs = (x[every, best] for x in (tries, z, costs))
         far = ~(z.abs() < OVERFLOW).all(1)
         z[far, n_p:], costs[far] = 0.0, torch.inf
@@ -375,7 +372,8 @@ class SequentialQP(nn.Module):
             better = solved & after.isfinite() & (after <= before + ROUNDING * scale)
             small = (step.abs().amax(1) <= SETTLED * u[todo].abs().amax(1)).all(1)
             change = solution.z - z[todo]
-            small |= (change * times(near.H, change)).sum(-1) <= ROUNDING**2 * scale
+            forces = times(near.H, change), ROUNDING * (times(near.H, z[todo]) + near.q)
+            small |= ((torch.stack(forces) * change).sum(-1).abs() <= ROUNDING**2 * scale).all(0)
             for own, new in zip((u, z, costs), (tries, *found), strict=True):
                 own[todo[better]] = new[among, best][better]
             converged[todo] = solved & small & (pull[todo] <= 1) & before.isfinite()
