@@ -277,9 +277,9 @@ class Controller:
                 last of which is held at the end; by default the last step's or reset's, and with an
                 environment the forecast in its ``info["known"]``, in the forms of `step`. An
                 environment must run the same signals. ``u``: the input to start from, by default
-                the last reset's. ``load``: a constant that is added to the inputs. ``noise``:
-                standard deviations of the outputs' noise, as a number, a vector or by name. ``x``:
-                the start state of a model. ``seed``: seeds the noise and the environment.
+                the last reset's, else a nonlinear model's own. ``load``: a constant that is added
+                to the inputs. ``noise``: standard deviations of the outputs' noise, as a number, a
+                vector or by name. ``x``: the start state of a model. ``seed``: seeds both.
 
         Raises:
             QPError: an argument is invalid.

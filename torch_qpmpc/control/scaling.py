@@ -5,6 +5,7 @@ A change of units multiplies a signal and its size alike, so it changes no decis
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -117,10 +118,7 @@ def _within(sizes: Array, others: Array) -> Array:
 
 def _first(*sizes: Array) -> Array:
     """Return the first of the sizes that is not zero, for each entry."""
-    result = sizes[0]
-    for size in sizes[1:]:
-        result = np.where(result > 0, result, size)
-    return result
+    return reduce(lambda first, size: np.where(first > 0, first, size), sizes)
 
 
 def _inverse(size: Array) -> Array:

@@ -79,6 +79,8 @@ def simulate(
 ) -> Run:
     """Return a closed loop; see `Controller.simulate`."""
     last = memory.rest[1] if u is None else read_table("u", u, law.design.plant.inputs, 1)[0]
+    if last is None and law.design.plant.dynamics is not None:
+        last = law.design.plant.point[-len(law.design.plant.inputs) :]
     begun = law.begun(last, not hasattr(plant, "reset"))
     options["near"] = 1.0 if u is None else FAINT
     loop = closed_loop(law, memory, plant, steps, r, begun.u, law.policy(begun), **options)
