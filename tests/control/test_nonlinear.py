@@ -169,8 +169,8 @@ def test_a_run_from_a_state_where_the_model_has_no_slope_says_how_to_start():
     model = lambda x, u: x + 0.1 * (u - x.sqrt()), [1.0], [1.0]  # at rest with zero: empty
     own = qm.Controller(qm.LinearMPC(model, 5, Q=1.0, dR=0.1, u_bounds=(0.0, 2.0)))
     with pytest.raises(SolverError, match="start elsewhere, by u or x"):
-        own.simulate(steps=2, r=[1.5])
-    assert_allclose(own.simulate(steps=60, r=[1.5], u=[1.0]).y[-1], 1.5, atol=1e-2)
+        own.simulate(steps=2, r=[1.5], u=[0.0])
+    assert_allclose(own.simulate(steps=60, r=[1.5]).y[-1], 1.5, atol=1e-2)
 
 
 def test_estimates_and_plans_survive_what_overflows():
@@ -235,10 +235,17 @@ def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path):
         assert_allclose(twin.step([1.9], r=[1.5]), own.step([1.9], r=[1.5]), rtol=1e-9)
 
 
+def test_a_loop_starts_at_the_models_point():
+    run = controller().simulate(steps=2, r=REST[0])
+    assert_allclose(run.u_last, REST[1])
+    assert_allclose(run.y, [REST[0]] * 3, atol=1e-6)
+
+
 def test_what_needs_matrices_refuses_functions(tmp_path, log):
     own = controller()
     for call in (
         lambda: own.export_c(tmp_path),
+        lambda: qm.export_c(own.mpc.plan, tmp_path),
         lambda: own.learn(log),
         lambda: own.improve(log),
         lambda: controller(learn=("H",)),

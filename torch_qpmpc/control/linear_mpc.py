@@ -181,6 +181,7 @@ class LinearMPC:
         """Make the QPs; those of the target are not learned."""
         self.design, self.horizon = design, design.horizon
         self.plan = QPMPC(lowered(design), **{**OPTIONS, **options})
+        vars(self.plan)["check_linear"] = design.plant.check_linear  # which `export_c` asks
         if self.plan.learned or self.plan.levels:
             design.plant.check_linear("learn and u_levels")
         self.targets = target_mpc(design)

@@ -182,6 +182,8 @@ def refuse(dtype: str, got: str, of: Tables | Export) -> NoReturn:
 
 def _check(mpc: QPMPC, settings: Settings) -> None:
     check_kind("mpc", mpc, QPMPC)
+    if (check_linear := getattr(mpc, "check_linear", None)) is not None:  # a `LinearMPC.plan`
+        check_linear("C and FMUs")
     check_choice("dtype", settings.dtype, tuple(REAL))
     check_choice("storage", settings.storage, ("fast", "small"))
     check_name(settings.name)
@@ -235,8 +237,7 @@ class CompiledPolicy:
         max_iterations: int | None = None,
     ) -> None:
         required_compiler()
-        settings = Settings("policy", dtype, storage, max_iterations)
-        self.export, _, library = build(mpc, settings)
+        self.export, _, library = build(mpc, Settings("policy", dtype, storage, max_iterations))
         assert library is not None
         self._library = library
         self._n_p, self._n_u, self._raises = mpc.n_p, mpc.n_u, mpc.on_failure == "raise"

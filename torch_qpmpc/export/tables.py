@@ -266,8 +266,7 @@ def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Arra
     q = -weighted.mT @ (lb + half)[rows]
     middle = QuadraticProgram(H, q, q.new_zeros(()), C, b, G, lb, ub, w, check_values=False)
     solution = solve_qp(middle, solver="daqp", on_failure="mask")
-    z = solution.z if solution.status == Status.SOLVED else torch.zeros_like(q)
-    p = z[:n_p].numpy()
+    p = (solution.z if solution.status == Status.SOLVED else torch.zeros_like(q))[:n_p].numpy()
     p[[*constants]] = [*constants.values()]
     return p
 
