@@ -196,6 +196,8 @@ def test_a_gain_of_one_s_own_places_the_observer_s_poles(form, tmp_path):
     [
         ([[0.5]], r"shape \(1, 1\), or NaN, expected finite numbers of \(2, 1\)"),
         ([[np.nan], [0.0]], r"shape \(2, 1\), or NaN"),
+        ([["much"], [0.0]], r"\[\['much'\], \[0.0\]\], expected a tensor, or what"),
+        (lambda F, H: None, "None, expected a tensor, or what"),
         ([[-1.0], [0.0]], r"errors of 1.8 times the last step's, expected F - F L H with eigen"),
     ],
 )

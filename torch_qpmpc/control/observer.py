@@ -13,6 +13,7 @@ from torch_qpmpc.control.disturbance import check_observable
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.innovations import Innovations
+from torch_qpmpc.mpc.validation import read_numbers
 
 #: Default standard deviations, relative to half of the bounds' distance.
 SMALL = 0.1
@@ -80,7 +81,7 @@ class Observer(NamedTuple):
         Raises:
             QPError: its shape is wrong, or errors of the estimates do not decay with it.
         """
-        L = np.array(gain(self.F, self.H) if callable(gain) else gain, float)
+        L = read_numbers("gain", gain(self.F, self.H) if callable(gain) else gain).numpy().copy()
         if L.shape != (shape := self.L.shape) or not np.isfinite(L).all():
             raise QPError.expected("gain", f"shape {L.shape}, or NaN", f"finite numbers of {shape}")
         radius = np.abs(np.linalg.eigvals(self.F - self.F @ L @ self.H)).max()

@@ -213,8 +213,7 @@ def _disturbances(design: Design) -> Finding:
     """The outputs tell the disturbances from the state."""
     plant, w = design.normal.plant, design.normal.disturbances
     matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
-    matrix = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    _, sizes, V = np.linalg.svd(matrix)
+    _, sizes, V = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
     ok = not w.names or bool(sizes[-1] > HIDDEN)
     told = f"The outputs {'' if ok else 'hardly '}tell the {', '.join(w.names)} from the state"
     text = f"{told} (singular value {sizes[-1]:.2g})." if w.names else "None is estimated."
