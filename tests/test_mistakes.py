@@ -128,6 +128,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("s: got a tensor on meta, expected one on cpu. Move it, or", lambda: mpc.value(S.to("meta"))),
     ("s: got shape (4, 1), expected shape (*batch, 2).", lambda: mpc.action_value(Aa, S)),
     ("a: got shape (3, 1), expected leading", lambda: mpc.action_value(zeros(4, 2), zeros(3, 1))),
+    ("a: got NoneType, expected a floating-point", lambda: mpc.action_value(S, None)),
     ("a: got a tensor on meta, expected one on cpu.", lambda: mpc.action_value(S, Aa.to("meta"))),
     ("rates: got ['G']", lambda: mpc.parameter_groups({"cost": 1.0, "constraints": 1.0, "G": 1.0})),
     # Operators, losses, penalties, the optimiser and the replay

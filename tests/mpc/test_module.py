@@ -608,3 +608,5 @@ def test_predict_takes_any_array_of_numbers(kind):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             np.testing.assert_allclose(mpc.predict(given), mpc.predict(s), rtol=1e-6)
+    with pytest.raises(QPError, match=r"observation: got ndarray, expected real numbers of shape"):
+        mpc.predict(s + 1j)

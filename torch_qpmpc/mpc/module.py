@@ -272,8 +272,7 @@ class QPMPC(nn.Module):
             layout = Layout(len(log.outputs), len(log.inputs), horizon, n_d=len(log.known))
             fitted = fit_rewards(trajectories, layout, hessian == "diagonal", model)
             cost = scheme_cost(fitted, layout, options.get("gamma", GAMMA), hessian)
-            given = {name: x for name, x in arguments.items() if x is not None}
-            arguments = {**vars(cost), **given}
+            arguments = vars(cost) | {name: x for name, x in arguments.items() if x is not None}
         return cls.of(**arguments)
 
     def value(self, s: Tensor, qp: QuadraticProgram | None = None) -> Tensor:
@@ -332,10 +331,12 @@ class QPMPC(nn.Module):
             observation = observation.detach().cpu()
         try:
             x = np.asarray(observation)
+            if np.iscomplexobj(x):
+                raise TypeError
             kind = x.dtype if x.dtype in (np.float16, np.float32) else np.float64
             x = np.array(x, kind, ndmin=1, order="C")  # torch warns of a read-only one
         except (TypeError, ValueError) as error:
-            got, want = type(observation).__name__, f"an array of shape (.., {self.n_p})"
+            got, want = type(observation).__name__, f"real numbers of shape (.., {self.n_p})"
             remedy = "Pass the observation alone; env.reset and env.step return more."
             raise QPError.expected("observation", got, want, remedy) from error
         if x.shape[-1:] != (self.n_p,):
@@ -375,7 +376,7 @@ class QPMPC(nn.Module):
                 invalid data.
             SolverError: with ``on_failure="raise"``, a QP has no certified solution.
         """
-        return self._solve(self._checked(s, a), qp, warm_start)
+        return self._solve(self._checked(s, *([] if a is None else [a])), qp, warm_start)
 
     def policy_and_active_set(
         self,
@@ -622,22 +623,21 @@ class QPMPC(nn.Module):
         weights = of_rows if self.scheme.bounds.discount_slack else torch.ones_like(of_rows)
         hardness = torch.where(self.soft, 0.0, torch.inf)
         derived = {"discount": discount, "slack_discount": weights, "hardness": hardness}
+        if self.layout.blocks:
+            derived["repetitions"] = self.layout.repetitions()
+            repeated = self.layout.repeated(self.scheme.of_actions).to(self.soft) & ~self.soft
+            self.register_buffer("repeated", repeated, persistent=False)
         for name, buffer in derived.items():
             self.register_buffer(name, buffer.to(self.C_0), persistent=False)
-        if self.layout.blocks:
-            repeated = self.layout.repeated(self.scheme.of_actions).to(self.soft) & ~self.soft
-            repetitions = self.layout.repetitions().to(self.C_0)
-            self.register_buffer("repetitions", repetitions, persistent=False)
-            self.register_buffer("repeated", repeated, persistent=False)
         for part in self.modules():
             if isinstance(part, Masked | Tied):
                 part.place(self.C_0.device)
 
-    def _checked(self, s: Tensor, a: Tensor | None = None) -> Tensor:
+    def _checked(self, s: Tensor, *a: Tensor) -> Tensor:
         """Return the fixed entries of z: s ``(*batch, n_p)``, or [s, a] ``(*batch, n_p + n_u)``."""
-        if a is None:
+        if not a:
             return check_tensor("s", s, self.n_p, device=self.C_0.device)
-        return check_pair(s, a, self.n_p, self.n_u, self.C_0.device)
+        return check_pair(s, a[0], self.n_p, self.n_u, self.C_0.device)
 
     def _solve(
         self,
