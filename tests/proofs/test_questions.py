@@ -171,6 +171,9 @@ def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
         ),
         (lambda: invariance(scheme(), Plant.of(A, B), Polytope.box([0.0], [1.0])), "n_p = 2"),
         (lambda: largest_difference(scheme(), two_actions(), BOX), "2 actions"),
+        (lambda: largest_difference(scheme(), scheme(), BOX, seconds=np.nan), "seconds: got nan"),
+        (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=-1.0), "seconds: got -1.0"),
+        (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=cast(Any, None)), "got None"),
     ],
 )
 def test_errors(ask, sentence):

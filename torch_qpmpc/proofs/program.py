@@ -107,14 +107,13 @@ class Program:
         cost, relaxed = np.zeros(len(self.lower)), relaxed or not self.binaries
         np.add.at(cost, objective.columns, -objective.matrix[0])
         size = np.abs(cost).max(initial=0.0) or 1.0  # HiGHS' tolerances are absolute
-        options = {"mip_rel_gap": 0.0} | ({"time_limit": seconds} if np.isfinite(seconds) else {})
         for presolve in (True, False):  # by presolve's round-off HiGHS can miss an optimum
             result = milp(
                 cost / size,
                 integrality=np.zeros(len(cost)) if relaxed else self.binary,
                 bounds=(self.lower, self.upper),
                 constraints=self._constraints(),
-                options=options | {"presolve": presolve},
+                options={"mip_rel_gap": 0.0, "time_limit": seconds, "presolve": presolve},
             )
             if result.status != UNKNOWN:
                 break

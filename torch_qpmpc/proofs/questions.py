@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_kind, check_whole
+from torch_qpmpc.checks import check_kind, check_number, check_whole
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
@@ -259,6 +259,7 @@ def _maximise(
     seconds: float,
 ) -> None:
     """Maximise rows of these sizes; ``replay`` maps variables to all rows, the run and its d."""
+    check_number("seconds", seconds, lambda x: x > 0, "a number of seconds > 0, or inf")
     began, answer.binaries = time.perf_counter(), max(answer.binaries, program.binaries)
     for i in range(len(rows.constant)):
         maximum = program.maximise(rows.part([i]), seconds=seconds)
