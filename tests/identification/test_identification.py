@@ -177,7 +177,7 @@ def discrete_actions(log: TensorDict) -> TensorDict:
 @refused(
     (
         lambda: qm.identify(lag_log(steps=4), N),
-        "trajectories: got 4 transitions in 1 trajectories, expected at least 5 for .* Log mo",
+        "trajectories: got 4 transitions in 1 trajectory, expected at least 5 for .* Log mo",
     ),
     (
         lambda: qm.identify(frozen_action(arx_log()), N),

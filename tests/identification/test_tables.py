@@ -49,6 +49,9 @@ def test_all_forms_are_the_same_log(tmp_path):
     tensors = {name: torch.tensor(array) for name, array in arrays.items()}
     for data in (file, str(file), arrays, tensors, dated):
         assert same(qm.read_log(data, **NAMES), expected)
+    masked = {name: np.ma.masked_values(array, array[7]) for name, array in arrays.items()}
+    frame[frame == frame.iloc[7]] = np.nan
+    assert same(qm.read_log(masked, **NAMES), qm.read_log(frame, **NAMES))
     shorter = {"T": arrays["T"], "q": arrays["q"][:-1], "T_out": arrays["T_out"][:-1]}
     assert same(qm.read_log(shorter, **NAMES), expected)
 

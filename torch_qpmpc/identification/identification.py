@@ -225,7 +225,8 @@ def check_excitation(log: Log) -> None:
     n_x, n_u, n_d = len(log.outputs), len(log.inputs), len(log.known)
     needed, trajectories = n_x + n_u + n_d + 1, log.trajectories
     if log.steps <= needed:
-        got = f"{log.steps} transitions in {len(trajectories)} trajectories"
+        parts = "1 trajectory" if len(trajectories) == 1 else f"{len(trajectories)} trajectories"
+        got = f"{log.steps} transitions in {parts}"
         expected = f"at least {needed + 1} for n_x={n_x}, n_u={n_u} and n_d={n_d}"
         remedy = "Log more: the error of as many transitions as coefficients says nothing."
         raise QPError.expected("trajectories", got, expected, remedy)

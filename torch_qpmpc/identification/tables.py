@@ -114,6 +114,7 @@ def _frame(part: Any) -> pd.DataFrame:
     columns: dict[str, pd.Series] = {}
     for name, value in part.items():
         array = np.asarray(ungraded(str(name), value))
+        array = np.ma.array(array, mask=np.ma.getmask(value))  # which is NaN for pandas
         if array.ndim not in (1, 2):
             raise QPError.expected(str(name), f"shape {array.shape}", "shape (T,) or (T, n)")
         for i, column in enumerate(np.atleast_2d(array.T)):
