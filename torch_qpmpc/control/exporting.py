@@ -140,6 +140,7 @@ def _build(
     law: Law, memory: Memory, name: str, missing: bool = False, **options: Any
 ) -> tuple[ControllerExport, dict[str, str]]:
     """Return a report without files, and the texts by file name."""
+    law.design.plant.check_linear("C and FMUs")  # a copy of a plan does not know
     check_name(name)
     mpc, settings = law.mpc, Settings(f"{name}_plan", **options)
     dtype = settings.dtype
