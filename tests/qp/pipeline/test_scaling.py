@@ -96,8 +96,8 @@ def test_entries_that_all_but_vanish_set_no_unit(solver, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_flat_costs_spoil_no_rates(seed):
     """The stock x + u - d with the flat costs of an exponential had rates from 1e-7 to 1."""
-    rates = {"A": [[1.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}
-    qp = QPMPC.of(2, 1, 30, stage_weight=[0.0, 0.0, 1e-7], **rates).quadratic_program()
+    A, B = [[1.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
+    qp = QPMPC.from_model(A, B, 30, stage_weight=[0.0, 0.0, 1e-7]).quadratic_program()
     sizes = 10 ** (-19 * torch.rand(30, generator=torch.Generator().manual_seed(seed)) ** 4)
     stock = torch.tensor([1.0, 1.0, 0.0]).double()
     curved = torch.block_diag(*(size * stock.outer(stock) for size in sizes), torch.zeros(2, 2))
