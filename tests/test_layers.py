@@ -37,7 +37,7 @@ BUDGET = {
     "identification": 2650,
     "mpc": 3844,
     "proofs": 1001,
-    "qp": 5319,  # caches that notice a called kernel, which the levels pay for
+    "qp": 5296,
     "study": 585,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

@@ -16,7 +16,7 @@ from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import TINY, Array, Tables, far
 from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.refinement import refine
 from torch_qpmpc.qp.pipeline.solve import solve_programs
@@ -73,7 +73,7 @@ def reference(mpc: QPMPC, p: Array, solver: str | None = None) -> BatchSolution:
     if mpc.levels is not None:
         with torch.no_grad():
             best = mpc._solve(torch.as_tensor(p), None, on_failure="mask")
-        return BatchSolution._make(to_numpy(getattr(best, x)) for x in BatchSolution._fields)
+        return BatchSolution._make(getattr(best, x).numpy() for x in BatchSolution._fields)
     qps = programs(mpc, p)
     return solve_programs(qps, solver or ("torch" if _is_large(qps) else "daqp"))
 

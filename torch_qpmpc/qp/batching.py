@@ -14,16 +14,12 @@ def align(in_dims: tuple, args: tuple, event_ndims: Sequence[int]) -> list[Any]:
 
     Arguments beyond those with ``event_ndims`` event dimensions are returned unchanged.
     """
-    tensors = [
-        (i, tensor, dim, n)
-        for i, (tensor, dim, n) in enumerate(zip(args, in_dims, event_ndims, strict=False))
-        if tensor is not None
-    ]
-    rank = max(tensor.ndim - n - (dim is not None) for _, tensor, dim, n in tensors)
+    known = list(zip(args, in_dims, event_ndims, strict=False))
+    rank = max(x.ndim - n - (dim is not None) for x, dim, n in known if x is not None)
     out = list(args)
-    for i, tensor, dim, n in tensors:
+    for i, (x, dim, n) in enumerate(known):
         if dim is not None:
-            moved = tensor.movedim(dim, 0)
+            moved = x.movedim(dim, 0)
             missing = rank - (moved.ndim - 1 - n)
             out[i] = moved.reshape(moved.shape[0], *(1,) * missing, *moved.shape[1:])
     return out

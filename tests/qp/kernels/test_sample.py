@@ -21,7 +21,6 @@ from tests.problems import (
 from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.kernels.sample import CLOSE
 from torch_qpmpc.qp.pipeline import batch
-from torch_qpmpc.qp.pipeline.arrays import to_numpy
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BackendSolution, daqp
 
@@ -114,7 +113,8 @@ def test_qps_of_a_batch_are_certified_as_each_alone(name, matrices):
 def test_a_candidate_is_completed_to_the_full_solution(matrices):
     for seed in range(4):
         known = known_qp(seed, batch=(BATCH,), matrices=matrices)
-        answer = programs_of(known).recover(BackendSolution(*map(to_numpy, soft_qps(known)[1])))
+        candidate = BackendSolution._make(x.numpy() for x in soft_qps(known)[1])
+        answer = programs_of(known).recover(candidate)
         assert (answer.status == 0).all()
         for name in ("value", "z", "lam", "chi", "xi"):
             assert_close(torch.from_numpy(getattr(answer, name)), getattr(known, name))

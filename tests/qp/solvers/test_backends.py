@@ -17,7 +17,7 @@ from tests.problems import (
 from tests.references import by_cvxpy, by_quadprog
 from tests.refused import refused
 from torch_qpmpc import SolveLog, solve_qp
-from torch_qpmpc.qp.pipeline.arrays import SoftQPs, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import SoftQPs
 from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solvers import BACKENDS, backend
 
@@ -174,7 +174,7 @@ def test_a_warm_start_from_the_solution_saves_iterations(name):
 def test_a_backend_answers_with_one_row_per_program(solver):
     known = known_qp(14, batch=(4,))
     qps, _ = soft_qps(known)
-    found = backend(solver)(SoftQPs._make(map(to_numpy, qps)))
+    found = backend(solver)(SoftQPs._make(x.numpy() for x in qps))
     assert found.v.shape == qps.g.shape
     assert found.lam.shape == qps.l.shape
     assert found.iterations.shape == (4,)

@@ -138,11 +138,6 @@ class BatchSolution(NamedTuple):
         self.put(index[better], others.at(better))
 
 
-def to_numpy(x: Array) -> np.ndarray:
-    """Return ``x`` as an array on the CPU, without a copy if it is there already."""
-    return x if isinstance(x, np.ndarray) else x.numpy(force=True)
-
-
 def to_tensor(x: Array) -> Tensor:
     """Return ``x`` as a tensor on its device, without a copy."""
     return torch.from_numpy(x) if isinstance(x, np.ndarray) else x

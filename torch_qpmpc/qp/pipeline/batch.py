@@ -22,17 +22,10 @@ from torch import Tensor
 from torch_qpmpc.qp.kernels import active_set, sample
 from torch_qpmpc.qp.kernels.linalg import Held, held
 from torch_qpmpc.qp.pipeline import condensing
-from torch_qpmpc.qp.pipeline.arrays import (
-    BackendSolution,
-    BatchSolution,
-    SoftQPs,
-    Theta,
-    per_qp,
-    to_numpy,
-)
+from torch_qpmpc.qp.pipeline.arrays import BackendSolution, BatchSolution, SoftQPs, Theta, per_qp
 from torch_qpmpc.qp.pipeline.condensing import Condensed, Dual, Elimination, Reduced, Sizes
 from torch_qpmpc.qp.pipeline.scaling import Units
-from torch_qpmpc.qp.program import NDIMS, UNKNOWN, broadcast
+from torch_qpmpc.qp.program import NDIMS, UNKNOWN, batch_shape, broadcast
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -175,16 +168,15 @@ _thread = threading.local()
 
 def prepared_for(data: Sequence[np.ndarray], n_kept: int) -> Prepared:
     """Return the cached preparation of H, q, .., w, which the whole batch shares."""
-    kind = (n_kept, data[0].dtype, *(x.shape for x in data))
-    content = tuple(x.tobytes() for x in data)
+    key = n_kept, data[0].dtype, *(x.shape for x in data), *(x.tobytes() for x in data)
     entries: list[tuple[tuple, Prepared]] = vars(_thread).setdefault("latest", [])
-    for position, ((other_kind, other), prepared) in enumerate(entries):
-        if other_kind == kind and other == content:
+    for position, (other, prepared) in enumerate(entries):
+        if other == key:
             entries.insert(0, entries.pop(position))
             return prepared
     theta = Theta.of([x[np.newaxis].copy() for x in data])  # the caller may change its own
     prepared = Prepared(theta, np.zeros(1, np.int64), n_kept)
-    entries.insert(0, ((kind, content), prepared))
+    entries.insert(0, (key, prepared))
     del entries[LATEST:]
     return prepared
 
@@ -214,8 +206,7 @@ class Programs:
         shared = all(x.ndim == n for x, n in zip(theta, NDIMS, strict=True))
         batch = fixed.shape[:-1]
         if not shared:
-            batches = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
-            batch = broadcast(batch, *batches)
+            batch = broadcast(batch, batch_shape(theta))
         fixed = np.ascontiguousarray(_flattened(fixed, batch, (n_f,)).numpy(force=True), float)
         flat = [x.numpy(force=True)[np.newaxis] for x in theta]
         group = np.zeros(len(fixed), np.int64)
@@ -360,7 +351,7 @@ def _flat_theta(theta: Sequence[Tensor], batch: torch.Size) -> tuple[list[np.nda
         event = x.shape[x.ndim - n :]
         shape = torch.Size([1]) if x.numel() == event.numel() else matrix_batch if n == 2 else batch
         rows = x.reshape(event) if len(shape) == 1 == shape[0] else x
-        rows = to_numpy(_flattened(rows, shape, event))
+        rows = _flattened(rows, shape, event).numpy(force=True)
         same = len(rows) > 1 and (rows[-1] == rows[0]).all() and (rows == rows[0]).all()
         flat.append(rows[:1] if same else rows)
     M = matrix_batch.numel()

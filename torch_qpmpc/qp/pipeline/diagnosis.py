@@ -69,11 +69,10 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
     This is Lawson and Hanson's least distance programming: for rows ``A v >= h``, the residual of
     ``min |[A'; h'] lam - e|`` over ``lam >= 0`` gives the point, or is zero if there is none.
     """
-    hard, y = np.isinf(qp.w), qp.G @ z
-    no_multipliers = np.zeros(len(hard))
+    hard, lam, y = np.isinf(qp.w), np.zeros(len(qp.w)), qp.G @ z
     lower, upper = (qp.lb - y)[hard], (qp.ub - y)[hard]
     if not (lower > 0).any() and not (upper < 0).any():
-        return z, no_multipliers
+        return z, lam
     norms = np.linalg.norm(qp.G[hard], axis=1)
     norms[norms == 0] = 1.0
     A = _product(qp.G[hard], C_range.null) / norms[:, None]
@@ -88,7 +87,7 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
     try:
         weights, _ = scipy.optimize.nnls(E, unit)
     except RuntimeError:  # nnls did not converge: neither proof
-        return z, no_multipliers
+        return z, lam
     weights[weights < ROUNDING * weights.max()] = 0.0
     residual = E @ weights - unit
     if residual[-1] < 0:
@@ -96,7 +95,6 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
     multipliers = np.zeros(len(norms))
     multipliers[above] = weights[below.sum() :]
     multipliers[below] -= weights[: below.sum()]
-    lam = no_multipliers
     lam[hard] = multipliers / norms
     return z, lam
 
@@ -114,15 +112,12 @@ def _contradict(
         chi = chi - C_range.inverse.T @ (qp.C.T @ chi + G_lam)
     largest = max(np.abs(chi).max(initial=0.0), np.abs(lam).max(initial=0.0))
     chi = _without_noise(chi, largest)
-    up, down, size = np.maximum(lam, 0), np.maximum(-lam, 0), np.abs(chi)
+    size = np.abs(chi)
     # Zero multipliers are skipped: their bounds may be infinite.
-    with np.errstate(invalid="ignore"):
-        charge = np.where(up > 0, up * qp.ub, 0) - np.where(down > 0, down * qp.lb, 0)
-        terms = np.where(up > 0, up * np.abs(qp.ub), 0)
-        terms += np.where(down > 0, down * np.abs(qp.lb), 0)
-    terms = terms.sum() + np.abs(qp.b) @ size
+    charge = lam * np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
+    terms = np.abs(charge).sum() + np.abs(qp.b) @ size
     residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
-    of_z = np.abs(qp.C).T @ size + np.abs(qp.G).T @ (up + down)
+    of_z = np.abs(qp.C).T @ size + np.abs(qp.G).T @ np.abs(lam)
     terms += np.minimum(np.abs(z), reach) @ of_z
     zero = residual <= ROUNDING * of_z
     # The residual is charged at the largest |z| that the hard rows allow.
@@ -148,14 +143,11 @@ def _reach(qp: Theta) -> np.ndarray:
 
 def _is_feasible(qp: Theta, z: np.ndarray) -> bool:
     """True if z satisfies C z = b and the hard rows."""
-    y, size = qp.G @ z, np.abs(qp.G) @ np.abs(z)
-    beyond = np.maximum(qp.lb - y, y - qp.ub)[np.isinf(qp.w)]
-    short = np.abs(qp.C @ z - qp.b)
-    C_size = np.abs(qp.C) @ np.abs(z) + np.abs(qp.b)
-    return bool(
-        (short <= TOLERANCE * (1 + C_size)).all()
-        and (beyond <= TOLERANCE * (1 + size[np.isinf(qp.w)])).all()
-    )
+    y, size, hard = qp.G @ z, np.abs(z), np.isinf(qp.w)
+    beyond = np.maximum(qp.lb - y, y - qp.ub)[hard]
+    errors = np.concatenate((np.abs(qp.C @ z - qp.b), beyond))
+    terms = np.abs(qp.C) @ size + np.abs(qp.b), np.abs(qp.G[hard]) @ size
+    return bool((errors <= TOLERANCE * (1 + np.concatenate(terms))).all())
 
 
 def _steepest_recession(qp: Theta, C_range: _Range) -> np.ndarray:

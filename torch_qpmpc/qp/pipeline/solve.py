@@ -19,12 +19,12 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import flatten_batch
-from torch_qpmpc.qp.pipeline.arrays import LONG, BatchSolution, SoftQPs, to_numpy
+from torch_qpmpc.qp.pipeline.arrays import LONG, BatchSolution, SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 from torch_qpmpc.qp.pipeline.refinement import refine
-from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
+from torch_qpmpc.qp.program import QuadraticProgram, Status, batch_shape, broadcast
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, backend, interior_point
 from torch_qpmpc.qp.solvers.interior_point import EARLY, LAST, MIDDLE, SETTLING
 
@@ -120,15 +120,14 @@ def solve_now(*arguments: Any) -> BatchSolution:
     try:
         programs, batch = Programs.of(*theta, fixed, n_kept=n_kept)
         if start is not None:
-            start = to_numpy(flatten_batch(start.expand(*batch, -1)).contiguous())
+            start = flatten_batch(start.expand(*batch, -1)).contiguous().numpy(force=True)
         solution = solve_programs(programs, solver, start, device)
     except (MemoryError, RuntimeError) as error:
         # torch's allocator on the CPU reports a failure only in the message.
         failed = isinstance(error, MemoryError | torch.OutOfMemoryError)
         if not failed and "DefaultCPUAllocator" not in str(error):
             raise
-        shapes = (x.shape[: x.ndim - n] for x, n in zip(theta, NDIMS, strict=True))
-        count = broadcast(*shapes, fixed.shape[:-1]).numel()
+        count = broadcast(batch_shape(theta), fixed.shape[:-1]).numel()
         got = f"{count:,} QPs of n_z = {q.shape[-1]}"
         remedy = f"Solve the batch in chunks, with torch.split. The allocation failed: {error}."
         raise QPError.expected("batch", got, "as many as fit in memory", remedy) from error
@@ -176,7 +175,7 @@ class AtRest:
     """
 
     def __init__(self, qp: QuadraticProgram, n_f: int, n_kept: int, solver: str) -> None:
-        data = [to_numpy(x.detach()) for x in qp.tensors()]
+        data = [x.numpy(force=True) for x in qp.tensors()]
         self.prepared, self.solver = prepared_for(data, n_kept), solver
         self._active = np.zeros((1, qp.lb.shape[-1]), np.int8)
         # The certificate proves nothing without a convex cost.

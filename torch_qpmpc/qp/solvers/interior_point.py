@@ -112,8 +112,7 @@ class BatchedQPs(NamedTuple):
         width, force = width * size, TYPICAL * force / size
         penalty, cost = PENALTY * curvature / size.square(), (force * width).amin(-1)
         curvature = curvature.squeeze(-1)
-        typical = (width, force, penalty, cost, curvature)
-        return cls(H, G, products, g, lower, upper, w, *typical)
+        return cls(H, G, products, g, lower, upper, w, width, force, penalty, cost, curvature)
 
     def take(self, index: Tensor) -> BatchedQPs:
         """Return the QPs at ``index``."""
