@@ -339,6 +339,7 @@ def test_a_value_of_a_cost_without_curvature_is_that_of_its_plan():
     mpc = QPMPC.of(1, 1, 3, dynamics=dynamics, **options)
     x, cost = torch.tensor([[-3.0], [0.3], [4.0]]).double(), 0.0
     solution = mpc.solve(x)
+    assert isinstance(solution, PlanSolution)
     for u in solution.plan.unbind(-2):
         x, stage = dynamics(x, u)
         cost = cost + stage

@@ -301,6 +301,7 @@ def solve(K, free, low, high, w, lam, y, side, held, n, factor, x, cutoff):
             most = abs(own - lam[row])
             step, stop, end = _longest(lam, side, w, low, high, held, x, n, NOISE, most)
             if step == np.inf:
+                near = min(abs(high[row]), abs(low[row]))
                 if abs(excess) > FEASIBLE * (abs(free[row]) + near):
                     return n, np.inf, changes
                 side[row] = 3  # rounding of rows that depend on each other
