@@ -44,7 +44,7 @@ def test_all_forms_are_the_same_log(tmp_path):
     expected = qm.read_log(frame, **NAMES)
     file = tmp_path / "room.csv"
     frame.to_csv(file, index=False)
-    arrays = {name: frame[name].to_numpy() for name in frame}
+    arrays = {name: frame[name].to_numpy(copy=True) for name in frame}
     dated = frame.set_index(pd.date_range("2024-03-01", periods=60, freq="15min"))
     tensors = {name: torch.tensor(array) for name, array in arrays.items()}
     for data in (file, str(file), arrays, tensors, dated):

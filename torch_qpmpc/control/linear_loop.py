@@ -91,7 +91,7 @@ class LinearLoop:
         A_c, B_c, C_c, D_c = self.controller
         z = np.exp(1j * np.geomspace(SLOWEST, np.pi, FREQUENCIES))[:, None, None]
         P, K = (
-            C @ np.linalg.solve(z * np.eye(len(A)) - A, B)
+            C @ np.linalg.solve(z * np.eye(len(A)) - A, B[None])  # NumPy 1 takes B for vectors
             for A, B, C in (self.plant, (A_c, B_c, C_c))
         )
         loop = (K + D_c) @ P * (self.units / self.units[:, None])

@@ -38,7 +38,7 @@ def draw_positions(
     def draw(paths: Tensor, *style: Any, **options: Any) -> None:
         """Draw paths ``(steps, starts, n_x)``."""
         x = paths[..., 0] if plane else (times[1] - times[0]) * torch.arange(len(paths))
-        axes.plot(x, paths[..., int(plane)], *style, **options)
+        axes.plot(x.numpy(), paths[..., int(plane)].numpy(), *style, **options)
 
     for name, loop in loops.items():
         colour = COLOURS.get(name)

@@ -41,6 +41,7 @@ def start(id: str | None, seed: int) -> Start:
     module = TensorDictModule(random, ["observation"], ["action"])
     log = env.rollout(125, module, break_when_any_done=False)
     mpc = qm.QPMPC.from_data(log, 10, gamma=0.98, **options)
+    bounds = plant.lb_a.to(env.action_spec.dtype), plant.ub_a.to(env.action_spec.dtype)
     return Start(env, mpc, lambda policy: gymnasium_loop(policy, plant, starts=8).J, bounds)
 
 
