@@ -180,6 +180,22 @@ def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> lis
 
 
 @pytest.mark.parametrize("clip", [None, 0.5])
+def test_targets_may_have_more_digits_than_states(clip):
+    """As they do if float64 is torch's default type, and so the type of gamma."""
+    operator, td = make_operator(), make_batch(6)
+    loss = make_loss(operator=operator, td_error_clip=clip)
+    loss(td.clone())["loss_value"].backward()
+    exact = [p.grad.clone() for p in loss.parameters()]
+    loss.zero_grad()
+    for key in ("observation", "action", ("next", "observation")):
+        td[key] = td[key].float()
+    assert loss.target(td).dtype == torch.float64
+    loss(td)["loss_value"].backward()
+    for parameter, gradient in zip(loss.parameters(), exact, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("clip", [None, 0.5])
 def test_one_sgd_step_is_the_papers_update(clip):
     """theta + alpha E[delta grad Q] (eq:thup) has no gradient through V(s+)."""
     operator, td, alpha = make_operator(), make_batch(6), 1e-3

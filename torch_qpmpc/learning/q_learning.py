@@ -251,7 +251,7 @@ class QPQLearningLoss(LossModule):
         use = usable(prediction, target)
         metadata = td_metadata(prediction.detach(), target, use)
         prediction = torch.where(use, prediction, 0)
-        target = torch.where(use, target, 0)
+        target = torch.where(use, target, 0).to(prediction)
         priority = (target - prediction).detach().square()
         tensordict.set(self.tensor_keys.priority, priority, inplace=True)
         loss = td_loss(prediction, target, self.td_error_clip)
