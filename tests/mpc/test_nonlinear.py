@@ -216,6 +216,20 @@ def test_a_saddle_says_that_the_plan_has_no_gradient():
         mpc.policy(s)
 
 
+@pytest.mark.parametrize("unit", [1e-18, 1.0, 1e12])
+def test_a_bound_holds_a_concave_cost_in_all_units(unit):
+    def dynamics(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        return x + 0.1 * u, -unit * u[..., 0] ** 2
+
+    options: Any = {"stage_weight": [0.3 * unit, 0.0], "action_bounds": ([-1.0], [1.0])}
+    mpc = QPMPC.of(1, 1, 3, dynamics=dynamics, solver="daqp", **options)
+    s = torch.ones(1, 1).double().requires_grad_()
+    solution: Any = mpc.solve(s)
+    assert solution.strict.all()
+    (slope,) = torch.autograd.grad(solution.z.sum(), s)  # of x_0, .., x_3
+    assert slope.item() == pytest.approx(4.0)
+
+
 @pytest.mark.parametrize("hard", [True, False])
 @pytest.mark.parametrize("units", [(1e-6, 1e5, 1e4), (1e5, 1e-6, 1.0), (1.0, 1e4, 1e-8)])
 def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):

@@ -206,6 +206,32 @@ def test_the_gradient_of_z_does_not_depend_on_the_units(cost, length):
     assert_close(found, ordinary, rtol=1e-8, atol=1e-8)
 
 
+@SOLVERS
+@pytest.mark.parametrize(("lower", "width"), [(1.0, 1e-7), (300.0, 1e-4), (1e7, 1.0), (-1e7, 1.0)])
+def test_a_row_within_close_bounds_is_not_held(lower, width, solver):
+    one, lb = vector(1.0), vector(lower)
+
+    def z(s: Tensor) -> Tensor:
+        qp = QuadraticProgram(one.diag(), -s, lb=lb, ub=lb + width, check_values=False)
+        return solve_qp(qp, solver=solver).z
+
+    for share, expected in ((0.5, 1.0), (1.5, 0.0)):
+        slope = torch.autograd.functional.jacobian(z, lb + share * width)
+        assert_close(slope, vector(expected)[None], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_a_multiplier_is_as_large_as_the_cost_of_its_variable(unit):
+    """Beside a variable that costs 1e8 times as much; it is 5e-9, and its bound is active."""
+    one = torch.ones(2, dtype=torch.float64)
+
+    def z(ub: Tensor) -> Tensor:
+        H, q = vector(1.0, 1e-8), vector(-3.0, -1.5e-8)
+        return solve_qp(QuadraticProgram((unit * H).diag(), unit * q, ub=ub), solver="daqp").z
+
+    assert_close(torch.autograd.functional.jacobian(z, one), one.diag(), rtol=0, atol=1e-9)
+
+
 # Structured points: bounds that coincide, opposite rows, corners
 
 INF = torch.inf

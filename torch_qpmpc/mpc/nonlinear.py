@@ -34,7 +34,7 @@ from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import report
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
-from torch_qpmpc.qp.solution import QPSolution, active_rows
+from torch_qpmpc.qp.solution import QPSolution, saturated_rows
 from torch_qpmpc.qp.solve import Eager, solve
 from torch_qpmpc.qp.tracing import is_eager
 
@@ -49,8 +49,8 @@ SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
 #: The price of a hard row's violation: relative to its largest multiplier, and before there is one
 #: to the cost of a violation by the row's bound; and the share of it that infeasible QPs may leave.
 PRICE, FIRM, SLIP = 2.0, 0.3, 1e-3
-#: The least eigenvalue of a definite Hessian, relatively.
-DEFINITE = 1e-9
+#: The least eigenvalue of a definite Hessian and multiplier of an active row, relatively.
+DEFINITE, ACTIVE = 1e-9, 1e-8
 #: The parts of a `QPSolution` besides its QP.
 PARTS = [*QPSolution.__annotations__][1:]
 
@@ -294,10 +294,10 @@ class SequentialQP(nn.Module):
             own = self.along(flat, known[1], known[2])
             solved = known[5] == Status.SOLVED
             strict = torch.zeros_like(solved)
-            strict[solved] = _strict(_taken(own, solved), fixed[solved], known[3][solved])
+            z, lam = known[1][solved], known[3][solved]
+            strict[solved] = _strict(_taken(own, solved), fixed[solved], z, lam)
             value, *rest = Known.apply(*own.tensors(), fixed, None, n_kept, solver, known)
-            no = ~strict.unsqueeze(-1)
-            known = (value, *(torch.where(no, x.detach(), x) for x in rest[:4]), *rest[4:])
+            known = (value, *(x.where(strict[:, None], x.detach()) for x in rest[:4]), *rest[4:])
         parts = (*known, u, converged, defect, strict)
         parts = (x if x is None else x.reshape((*batch, *x.shape[1:])) for x in parts)
         return PlanSolution(qp, *parts)
@@ -472,7 +472,7 @@ def _taken(qp: QuadraticProgram, index: Any = slice(None), more: int = 0) -> Qua
     return QuadraticProgram(*parts, check_values=False)
 
 
-def _strict(qp: QuadraticProgram, fixed: Tensor, lam: Tensor) -> Tensor:
+def _strict(qp: QuadraticProgram, fixed: Tensor, z: Tensor, lam: Tensor) -> Tensor:
     """Return the mask of plans whose Hessian is positive definite where active rows leave them."""
     theta, n_f = qp.tensors(), fixed.shape[-1]
     programs, _ = Programs.of(*theta, fixed.detach(), n_kept=n_f)
@@ -481,8 +481,10 @@ def _strict(qp: QuadraticProgram, fixed: Tensor, lam: Tensor) -> Tensor:
     size = H[:, n_f:].diagonal(dim1=1, dim2=2).abs().sqrt()  # units in which no other has a part
     size = torch.where(size > 0, size, 1.0).unsqueeze(1)
     H, G = H[:, n_f:] / size / size.mT, G / size
-    force = G.norm(dim=-1)
-    held = active_rows(lam * force, theta[6], theta[7], theta[8] * force)[0]
+    force = lam.abs() * G.norm(dim=-1)
+    cost = (times(theta[0], z) * z).sum(-1, keepdim=True).abs().sqrt()
+    held = force > ACTIVE * torch.cat((force, cost), dim=-1).amax(-1, keepdim=True)
+    held = (held | (theta[6] >= theta[7])) & ~saturated_rows(lam, theta[8])
     rows = torch.where(held.unsqueeze(-1), F.normalize(G, dim=-1), 0)
     kept = torch.linalg.pinv(rows) @ rows
     free = torch.eye(H.shape[-1]).to(H) - kept

@@ -19,8 +19,8 @@ from torch_qpmpc.qp.kernels.active_set import hold
 from torch_qpmpc.qp.kernels.batched import largest, multiply, null_space_inverses
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs
-from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, TOLERANCE, Status, broadcast
-from torch_qpmpc.qp.solution import ACTIVE_FRACTION, active_rows
+from torch_qpmpc.qp.program import EVENT_SHAPES, NDIMS, Status, broadcast
+from torch_qpmpc.qp.solution import saturated_rows
 from torch_qpmpc.qp.tracing import has_values, is_differentiating
 
 #: The Schur complement's solution is accepted with a relative residual up to this, ..
@@ -29,8 +29,10 @@ REGULAR = 1e-12
 PASSES = 2
 #: H is flat in a direction whose curvature is, relative to its largest entry, below this.
 FLAT = 1e-14
-#: A row is at its bound within this fraction of its size, the certificate's tolerance.
-AT_BOUND = TOLERANCE
+#: A multiplier is zero, and a row at its bound, within this fraction of their sizes.
+ZERO = 1e-9
+#: Curvature counts as no less than this fraction of the largest.
+CURVED = 1e-5
 #: Unit normals that differ by at most this are parallel: data in float32 are no more accurate.
 PARALLEL = 1e-6
 #: Rounding errors grow by more than this along an unstable model.
@@ -98,7 +100,7 @@ def _solve_kkt(programs: Programs, *vectors: Tensor) -> tuple[Tensor, ...]:
     condensed = programs.prepared.condensed(n_f)
     T, H_y, G_y = map(to_tensor, (condensed.T, condensed.H, condensed.G))
     factors = *condensed[1:3], condensed.spans[4], programs.group
-    active = _rows_at_bounds(programs, multiply(G, group, z), lam)
+    active = _rows_at_bounds(programs, z, lam)
     rows = programs.prepared.sizes(n_f).bounds
     alone = active.numpy()[:, rows[rows >= 0]] & (not condensed.deficient)
     if alone.any() and programs.prepared.growth(n_f) > GROWTH:
@@ -143,27 +145,33 @@ def _solve_pinned(
     return p, r, t, u
 
 
-def _rows_at_bounds(programs: Programs, y: Tensor, lam: Tensor) -> Tensor:
+def _rows_at_bounds(programs: Programs, z: Tensor, lam: Tensor) -> Tensor:
     """Return the mask of rows y = G z that stay at a bound if the data change, ``(B, n_g)``.
 
-    They are those of `active_rows`, those at a bound with a multiplier beyond rounding, and those
-    that `implied_equalities` adds; rows without a free variable have no part in the KKT system.
+    They are those with lb = ub, those whose multiplier is beyond rounding and exceeds their slack,
+    and those that `implied_equalities` adds. In units of y that make H's diagonal one, y and lam
+    are roots of costs: they compare, with each other and with that of z'Hz, in all units of a QP.
     """
-    lb, ub, w = map(to_tensor, programs.theta[6:9])
-    held, saturated = active_rows(lam, lb, ub, w)
-    condensed = programs.prepared.condensed(programs.n_f)
-    entering = to_tensor(condensed.enters[:, programs.n_f :].any(-1))
-    near, beyond = AT_BOUND * (1 + y.abs()), torch.maximum(lb - y, y - ub)
-    saturated |= w.isfinite() & (lam != 0) & (beyond > near)
-    most = near.maximum(torch.where(w.isinf(), lam.abs(), 0))  # soft lam may be rounding
-    held |= (lam.abs() > ACTIVE_FRACTION) & (beyond > -most)
-    held &= entering & ~saturated
-    free = ~(held | saturated) & entering
-    lower, upper = free & (y - lb <= near), free & (ub - y <= near)
-    if (weak := (lower | upper).any(-1)).any():
-        G = condensed.G[:, :, programs.n_f :]
-        masks = (x[weak].numpy() for x in (lower, upper, held))
-        held[weak] |= torch.from_numpy(_all_implied(G, programs.group[weak.numpy()], *masks))
+    reduced, theta = programs.prepared.reduced(programs.n_f), programs.theta
+    group, rows, held = to_tensor(programs.group), reduced.rows, torch.zeros_like(lam).bool()
+    curvature = to_tensor(reduced.H).diagonal(dim1=1, dim2=2).abs()
+    flat = CURVED * largest(curvature, keepdim=True)
+    curvature = curvature.maximum(flat.where(flat > 0, 1)).unsqueeze(1)
+    unit = (to_tensor(reduced.G) ** 2 / curvature).sum(-1).sqrt()[group]
+    lower, upper = (to_tensor(x[:, rows]) / unit for x in theta[6:8])
+    w, lam = to_tensor(theta.w[:, rows]) * unit, lam[:, rows] * unit
+    y = multiply(to_tensor(theta.G), group, z)[:, rows] / unit
+    size = (z * multiply(to_tensor(theta.H), group, z)).sum(-1, keepdim=True).abs().sqrt()
+    near, slack = ZERO * (size + y.abs()), torch.where(lam > 0, upper - y, y - lower)
+    force = lam.abs()
+    saturated = saturated_rows(lam, w) | (-slack > w - force)
+    own = (force > ZERO * size) & (slack < near.maximum(force)) | (lower >= upper)
+    own, free = own & ~saturated, ~(own | saturated)
+    below, above = free & (y - lower <= near), free & (upper - y <= near)
+    if (weak := (below | above).any(-1)).any():
+        masks = (x[weak].numpy() for x in (below, above, own))
+        own[weak] |= to_tensor(_all_implied(reduced.G, programs.group[weak.numpy()], *masks))
+    held[:, rows] = own
     return held
 
 

@@ -10,23 +10,13 @@ from torch import Tensor
 from torch_qpmpc.qp.program import QuadraticProgram, Status
 from torch_qpmpc.qp.tracing import full_precision, has_values
 
-#: A multiplier below this fraction of the largest is zero; one this close to w is saturated.
-ACTIVE_FRACTION = 1e-8
-
-
-def active_rows(lam: Tensor, lb: Tensor, ub: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the masks of rows held at a bound and saturated at |lam| = w, ``(*batch, n_g)``.
-
-    A row with lb = ub is held whatever its multiplier.
-    """
-    saturated, size = saturated_rows(lam, w), lam.abs()
-    largest = size.amax(-1, keepdim=True) if size.shape[-1] else size
-    return ((size > ACTIVE_FRACTION * (1 + largest)) | (lb >= ub)) & ~saturated, saturated
+#: A multiplier this close to w, relatively, is saturated.
+SATURATED = 1e-8
 
 
 def saturated_rows(lam: Tensor, w: Tensor) -> Tensor:
     """Return the mask of rows with |lam| = w, ``(*batch, n_g)``."""
-    return w.isfinite() & (lam.abs() >= (1 - ACTIVE_FRACTION) * w)
+    return w.isfinite() & (lam.abs() >= (1 - SATURATED) * w)
 
 
 def upper_share(z: Tensor, lam: Tensor, G: Tensor, lb: Tensor, ub: Tensor) -> Tensor:
