@@ -57,6 +57,15 @@ def test_plans_that_run_away_are_solved_on_their_active_sets():
     assert judge(case, solution).certified.all()
 
 
+def test_terms_that_cancel_are_the_unit_of_their_value():
+    """Far along a flat direction, terms of 5,000 leave a value of 31, which errs by 1e-4."""
+    case = FAMILIES["ill conditioned H"](Draw(90004), 15)
+    solution = solve_qp(case.known.qp, case.known.fixed, solver="daqp", on_failure="mask")
+    assert judge(case, solution).certified.all()
+    worse = replace(solution, value=1.01 * solution.value)
+    assert judge(case, worse).wrong.all()
+
+
 def solved(seed: int = 0) -> tuple[families.Case, QPSolution]:
     case = well_posed(Draw(seed), 4)
     return case, solve_qp(case.known.qp, case.known.fixed, solver="daqp")
