@@ -150,7 +150,7 @@ def _rows_at_bounds(programs: Programs, z: Tensor, lam: Tensor) -> Tensor:
 
     They are those with lb = ub, those whose multiplier is beyond rounding and exceeds their slack,
     and those that `implied_equalities` adds. In units of y that make H's diagonal one, y and lam
-    are roots of costs: they compare, with each other and with that of z'Hz, in all units of a QP.
+    are roots of costs: they compare, with each other and with z, in all units of a QP.
     """
     reduced, theta = programs.prepared.reduced(programs.n_f), programs.theta
     group, rows, held = to_tensor(programs.group), reduced.rows, torch.zeros_like(lam).bool()
@@ -161,7 +161,7 @@ def _rows_at_bounds(programs: Programs, z: Tensor, lam: Tensor) -> Tensor:
     lower, upper = (to_tensor(x[:, rows]) / unit for x in theta[6:8])
     w, lam = to_tensor(theta.w[:, rows]) * unit, lam[:, rows] * unit
     y = multiply(to_tensor(theta.G), group, z)[:, rows] / unit
-    size = (z * multiply(to_tensor(theta.H), group, z)).sum(-1, keepdim=True).abs().sqrt()
+    size = multiply(to_tensor(theta.H).diagonal(dim1=1, dim2=2).abs()[:, None], group, z**2).sqrt()
     near, slack = ZERO * (size + y.abs()), torch.where(lam > 0, upper - y, y - lower)
     force = lam.abs()
     saturated = saturated_rows(lam, w) | (-slack > w - force)
