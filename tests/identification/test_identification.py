@@ -154,6 +154,11 @@ def test_a_simulation_is_the_plant_without_corrections():
     for name, wrong in {"u": (u[:, :0], y[:1], d), "y": (u, y[0], d), "d": (u, y[:1])}.items():
         with pytest.raises(QPError, match=rf"^{name}: got shape \(.*\), expected \("):
             found.simulate(*wrong)
+    for name, words in {"u": ("on", y, d), "y": (u, {"T": 1}, d), "d": (u, y, [["a"]])}.items():
+        with pytest.raises(QPError, match=f"^{name}: got (str|dict|list), expected an array of"):
+            found.simulate(*words)
+    with pytest.raises(QPError, match=r"^u: got shape \(\), expected"):
+        found.simulate(3.0, y[:1])
 
 
 # Bad data

@@ -68,16 +68,35 @@ def test_the_order_of_a_short_log_in_one_piece_is_enough(log, new, order):
     assert found.R2[-1].item() > 0.99 * (1 - off(told, new) ** 2 / log["y"].var())
 
 
+def late_log(delay: int, noise: float) -> dict[str, np.ndarray]:
+    """Return the log of an output that the first of two inputs moves after a dead time."""
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, (120, 2)).repeat(10, 0), np.zeros(1201)
+    for k in range(1200):
+        late = 0.5 * u[k - delay, 0] if k >= delay else 0.0
+        y[k + 1] = 0.8 * y[k] + late + 0.1 * u[k, 1]
+    return {"y": y + noise * rng.normal(size=1201), "u": u}
+
+
 def test_an_order_is_that_of_a_dead_time_beyond_the_horizons_that_decide():
     """The singular vectors of twenty predictions were at most twenty states: it was 0."""
-    rng, delay = np.random.default_rng(0), 24
-    u, y = rng.uniform(-1, 1, 60).repeat(10), np.zeros(601)
-    for k in range(600):
-        y[k + 1] = 0.8 * y[k] + (0.5 * u[k - delay] if k >= delay else 0.0)
-    y += 0.02 * rng.normal(size=601)
-    found = qm.identify({"y": y, "u": u}, order=delay + 1)
-    assert found.fit.order == delay + 1
+    found = qm.identify(late_log(24, 0.02), order=25)
+    assert found.fit.order == 25
     assert found.R2[-1].item() > 0.99
+
+
+def test_a_dead_time_beyond_the_orders_is_told_with_the_order_that_finds_it():
+    log = qm.read_log(late_log(30, 0.1), outputs=["y"], inputs=["u"])
+    with pytest.warns(UserWarning, match="^y follows u1 3[01] rows late: .* pass order=") as told:
+        assert qm.identify(log).R2[-1] < 0.5
+    order = int(str(told[0].message).rstrip(".").split("=")[1])
+    assert qm.identify(log, order=order).R2[-1] > 0.97
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("log", [late_log(4, 0.1), late_log(0, 0.0)], ids=["early", "exact"])
+def test_what_an_order_reaches_is_not_late(log):
+    qm.identify(log)
 
 
 def test_an_order_above_what_the_log_shows_is_what_it_shows():

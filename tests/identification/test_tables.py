@@ -254,6 +254,31 @@ def test_a_few_numbers_that_are_far_from_all_others_are_named(rows, said):
     assert [str(x.message)[: len(named)] for x in caught] == [named] * said
 
 
+def slow(hold: int, step: float = 0.0) -> dict[str, np.ndarray]:
+    """Return the log of two outputs, of which a sensor shows the first in every fifth row."""
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(0, 12, 200 // hold + 1).repeat(hold)[:200], np.full((200, 2), 18.0)
+    for k in range(199):
+        y[k + 1] = y[k] - 0.1 * (y[k] - 5) + 0.25 * u[k]
+    y = y + 0.03 * rng.normal(size=(200, 2))
+    y = np.round(y / step) * step if step else y
+    return {"y1": y[np.arange(200) // 5 * 5, 0], "y2": y[:, 1], "u": u}
+
+
+def test_the_repeats_of_a_slow_sensor_are_missing():
+    """They made it a random walk in short logs."""
+    with pytest.warns(UserWarning, match="y1 has a new value every 5 rows: its repeats are taken"):
+        log = qm.read_log(slow(8))
+    assert log.trajectories[0].y.isfinite().sum(0).tolist() == [40, 200]
+    assert qm.identify(log).R2[-1].min() > 0.98
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("log", [slow(5), slow(8, 2.0)], ids=["inputs repeat, too", "quantised"])
+def test_other_repeats_stay(log):
+    assert qm.read_log(log).trajectories[0].y.isfinite().all()
+
+
 def test_a_response_that_is_rare_is_no_error():
     u, y = np.zeros(400), 1e-3 * np.random.default_rng(0).normal(size=401)
     u[100] = 1.0

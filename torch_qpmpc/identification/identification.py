@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_whole, ungraded
+from torch_qpmpc.checks import check_whole, class_name, ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import STILL, Log
@@ -26,12 +26,11 @@ from torch_qpmpc.identification.subspace import (
     explained_by_inputs,
     fit_state_space,
     held_out_errors,
+    late_inputs,
     visited,
     whiteness,
 )
 
-#: Steps of a prediction by default.
-HORIZON = 20
 #: The covariance of a simulation's start, relative to that of the log's states.
 ELSEWHERE = 10.0
 #: The share of the residuals' variance that the inputs of the same rows may explain.
@@ -103,23 +102,24 @@ class Identified:
         Raises:
             QPError: a shape does not match the model.
         """
-        model = self.fit.model
-        n_d, n_y, n_u = model.E.shape[1], len(model.C), model.B.shape[1]
-        named = {"u": u, "y": y, "d": np.zeros((len(u), 0)) if d is None else d}
-        u, y, d = (np.asarray(ungraded(name, x), dtype=float) for name, x in named.items())
-        steps = len(u) if u.ndim else 0
-        first = min(len(y) if y.ndim else 0, steps + 1)
-        sizes = {"u": (u, (steps, n_u)), "y": (y, (max(first, 1), n_y)), "d": (d, (steps, n_d))}
-        for name, (value, shape) in sizes.items():
+        model, arrays = self.fit.model, []
+        for name, x in {"u": u, "y": y, "d": d}.items():
+            try:
+                arrays.append(np.asarray(ungraded(name, x), dtype=float))
+            except (TypeError, ValueError) as error:
+                raise QPError.expected(name, class_name(x), "an array of numbers") from error
+        u, y, steps = *arrays[:2], len(arrays[0]) if arrays[0].ndim else 0
+        d = np.zeros((steps, 0)) if d is None else arrays[2]
+        first, n_y = min(len(y) if y.ndim else 0, steps + 1), len(model.C)
+        sizes = {"u": (steps, model.B.shape[1]), "y": (max(first, 1), n_y)}
+        sizes["d"] = steps, model.E.shape[1]
+        for value, (name, shape) in zip((u, y, d), sizes.items(), strict=True):
             if value.shape != shape:
                 raise QPError.expected(name, f"shape {value.shape}", f"{shape}")
         mean, cov = visited(model, self.log.trajectories)
-        model = model._replace(x0=mean, P0=ELSEWHERE * cov)
-        x, outputs = model.estimates(y, u[: first - 1], d[: first - 1])[-1], [*y]
-        for inputs in model.inputs(u, d)[first - 1 :]:
-            x = model.A @ x + inputs
-            outputs.append(model.C @ x)
-        return torch.as_tensor(np.stack(outputs))
+        seen = np.vstack((y, np.full((steps + 1 - first, n_y), np.nan)))
+        x = model._replace(x0=mean, P0=ELSEWHERE * cov).estimates(seen, u, d)
+        return torch.as_tensor(np.vstack((y, x[first:] @ model.C.T)))
 
     def __str__(self) -> str:
         log, N = self.log, self.horizon
@@ -157,7 +157,7 @@ class Identified:
 
 def identify(
     trajectories: Any,
-    horizon: int = HORIZON,
+    horizon: int = 20,
     *,
     order: int | None = None,
     n_d: int | None = None,
@@ -196,6 +196,11 @@ def identify(
     log = as_log(trajectories, n_x, n_d)
     check_excitation(log)
     fit = fit_state_space(log.trajectories, order)
+    if order is None and (late := late_inputs(fit, log.trajectories)).any():
+        names = [(log.outputs[i], log.inputs[j], late[i, j]) for i, j in np.argwhere(late)]
+        text = ", ".join(f"{y} follows {u} {rows} rows late" for y, u, rows in names)
+        advice = f"If these are dead times, pass order={fit.order + late.max(0).sum()}."
+        warnings.warn(f"{text}: a model of order {fit.order} ends before. {advice}", stacklevel=2)
     if order and not fit.order:
         warnings.warn(f"order: {log.steps} steps show no states but the outputs", stacklevel=2)
     return Identified(fit.model.disturbed(), log, int(horizon), fit)

@@ -20,7 +20,6 @@ from torch.nn import functional as F
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.identification import Identified, identify
-from torch_qpmpc.identification.log import complete
 from torch_qpmpc.identification.ridge import ridge
 
 #: The networks, their width, and the steps, rate and batch of their training.
@@ -124,12 +123,14 @@ def identify_nonlinear(trajectories: Any, cost: Any = None) -> LearnedModel:
     """
     given = isinstance(trajectories, Identified)
     own = trajectories if given else identify(trajectories, order=0)
-    data = complete(own.log.trajectories)
+    data = own.log.trajectories
     if given:
         x = own.fit.model.estimates
-        data = [(torch.as_tensor(x(*map(np.asarray, z))), *z[1:]) for z in own.log.trajectories]
+        data = [(torch.as_tensor(x(*map(np.asarray, z))), *z[1:]) for z in data]
     parts = zip(*((y[:-1], y[1:], u, d) for y, u, d in data), strict=True)
     x, after, u, d = map(torch.cat, parts)
+    seen = (x + after).isfinite().all(1)
+    x, after, u, d = x[seen], after[seen], u[seen], d[seen]
     if cost is not None:
         cost = torch.as_tensor(cost, dtype=torch.float64).reshape(-1)
         if len(cost) != len(u):

@@ -45,37 +45,27 @@ class Noisy(NamedTuple):
     P0: Array
 
 
-def batches(data: Sequence[Signals]) -> list[tuple[list[int], Array, Array]]:
-    """Return trajectories of the same length together, with their places."""
-    return [
-        (group, np.stack([data[i].y for i in group]), np.stack([data[i].v for i in group]))
-        for group in grouped(len(one.v) for one in data)
-    ]
-
-
 class Group(NamedTuple):
     """Trajectories ``(G, T + 1, ..)`` with the same missing outputs.
 
     ``kinds`` are the rows ``(K, n_y)`` of outputs that are seen together, ``kind`` ``(T + 1,)``
-    the one of each step; ``places`` are those of the trajectories in the log.
+    the one of each step.
     """
 
     y: Array
     v: Array
     kinds: Array
     kind: Array
-    places: list[int]
 
 
 def groups_of(data: Sequence[Signals]) -> list[Group]:
     groups = []
-    for places, y, v in batches(data):
-        for rows in grouped(one.tobytes() for one in np.isnan(y)):
-            seen = ~np.isnan(y[rows[0]])
-            codes = seen @ 2.0 ** np.arange(y.shape[-1])
-            _, first, kind = np.unique(codes, return_index=True, return_inverse=True)
-            own = [places[i] for i in rows]
-            groups.append(Group(y[rows], v[rows], seen[first], kind, own))
+    for rows in grouped(np.isnan(one.y).tobytes() for one in data):
+        y, v = map(np.stack, zip(*(data[i] for i in rows), strict=True))
+        seen = ~np.isnan(y[0])
+        codes = seen @ 2.0 ** np.arange(y.shape[-1])
+        _, first, kind = np.unique(codes, return_index=True, return_inverse=True)
+        groups.append(Group(y, v, seen[first], kind))
     return groups
 
 
@@ -131,10 +121,9 @@ def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
     """
     n, n_y = moments[0].x.shape[-1], groups[0].y.shape[-1]
     Szz: Any = 0.0
-    Sx1 = S11 = Szz
+    N = Sx1 = S11 = Szz
     Sxx, Syx = np.zeros((n_y, n, n)), np.zeros((n_y, n))
-    N = 0
-    for (y, v, kinds, kind, _), one in zip(groups, moments, strict=True):
+    for (y, v, kinds, kind), one in zip(groups, moments, strict=True):
         x, G = one.x, len(y)
         z = np.concatenate((x[:, :-1], v), -1).reshape(-1, n + v.shape[-1])
         x1 = x[:, 1:].reshape(-1, n)
@@ -151,7 +140,7 @@ def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
     AB = np.linalg.solve(_lifted(Szz), Sx1.T).T
     C = np.stack([np.linalg.solve(_lifted(xx), yx) for xx, yx in zip(Sxx, Syx, strict=True)])
     RR, M = np.zeros((n_y, n_y)), np.zeros((n_y, n_y))
-    for (y, _, kinds, kind, _), one in zip(groups, moments, strict=True):
+    for (y, _, kinds, kind), one in zip(groups, moments, strict=True):
         e = np.where(np.isnan(y), 0.0, y - one.x @ C.T)
         for i, seen in enumerate(kinds):
             both, rows = np.outer(seen, seen), e[:, kind == i].reshape(-1, n_y)

@@ -93,24 +93,15 @@ def runs(mask: Any) -> np.ndarray:
     return np.flatnonzero(np.diff(mask, prepend=False, append=False)).reshape(-1, 2)
 
 
-def complete(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Cut trajectories at rows with missing outputs."""
-    cuts = [(one, runs(one.y.isfinite().all(1).numpy())) for one in trajectories]
-    return [one.between(i, k - 1) for one, rows in cuts for i, k in rows.tolist() if k - i > 1]
-
-
 def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajectory]]:
     """Cut all steps into ``count`` consecutive parts of nearly equal length."""
-    total = sum(trajectory.steps for trajectory in trajectories)
+    total, begin = sum(trajectory.steps for trajectory in trajectories), 0
     bounds = [total * i // count for i in range(count + 1)]
     parts: list[list[Trajectory]] = [[] for _ in range(count)]
-    begin = 0
     for trajectory in trajectories:
-        steps = trajectory.steps
         for part, first, last in zip(parts, bounds[:-1], bounds[1:], strict=True):
-            start, stop = max(first - begin, 0), min(last - begin, steps)
+            start, stop = max(first - begin, 0), min(last - begin, trajectory.steps)
             if start < stop:
-                whole = stop - start == steps
-                part.append(trajectory if whole else trajectory.between(start, stop))
-        begin += steps
+                part.append(trajectory.between(start, stop))
+        begin += trajectory.steps
     return parts

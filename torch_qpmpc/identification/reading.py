@@ -71,19 +71,7 @@ def read_log(
 
 
 def as_log(data: Any, n_x: int | None = None, n_d: int | None = None) -> Log:
-    """Return ``data`` as a `Log`, read by `read_log` if it is none.
-
-    A trajectory of steps in a TensorDict ends at a done flag, where the id of the trajectory
-    changes, and where the next observation is not the one of the following step, as in steps
-    sampled at random. Masks of padded steps are respected.
-
-    Args:
-        data: a `Log`, or as in `read_log`; or steps ``(T,)`` or ``(episodes, T)``, or a lazy stack
-            or list of ``(T,)`` of different lengths, with ``observation``, ``action``, ``("next",
-            "observation")`` and, for ``n_d > 0``, ``preview``, whose first entries are d_k.
-        n_x: the number of outputs, the last entries of ``observation``; None for all of them.
-        n_d: entries of d_k.
-    """
+    """Return ``data``, what `identify` takes with ``n_x`` and ``n_d``, as a `Log`."""
     if is_steps(data):
         return named(of_steps(data, n_x, 0 if n_d is None else n_d))
     log = data if isinstance(data, Log) else read_log(data)

@@ -59,9 +59,7 @@ def _of_rows(data: Any, n_x: int | None, n_d: int) -> list[Trajectory]:
     if y.shape[-1] != following.shape[-1]:
         got = f"{following.shape[-1]} entries, but {y.shape[-1]} in observation"
         raise QPError.expected(_name(NEXT), got, "the same number in both")
-    d = u.new_zeros(*u.shape[:-1], 0)
-    if n_d:
-        d = _entry(steps, ("preview",), valid, n_d, first=True)
+    d = _entry(steps, ("preview",), valid, n_d, first=True) if n_d else u[..., :0]
     valid, ends = cuts(steps, n_x)
     trajectories = []
     for row in range(len(y)):

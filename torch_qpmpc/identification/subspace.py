@@ -21,12 +21,11 @@ import scipy  # imports its parts at their first use: a fifth of a second
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
-from torch_qpmpc.identification.filter import Array
+from torch_qpmpc.identification.filter import Array, grouped
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.likelihood import (
     Noisy,
     Signals,
-    batches,
     em,
     starting,
     steady,
@@ -63,8 +62,9 @@ CONSTANT, LAST, LEVEL, TINY = 0.5, 10, 0.01, 1e-300
 #: So many orders, whose starts have the least errors, are compared by their likeliest models; more,
 #: then with other lags, while the rows of their logs together are at most ROWS.
 REFINED, ROWS = 2, 10_000
-#: Autocorrelations of the residuals in the test of whiteness.
-CORRELATIONS = 20
+#: Autocorrelations of the residuals in the test of whiteness. An input acts late, by at most LATEST
+#: rows, if its correlation with them is SURE standard errors and its square SEEN.
+CORRELATIONS, LATEST, SURE, SEEN = 20, 100, 5.0, 0.02
 
 
 class Candidate(NamedTuple):
@@ -150,14 +150,35 @@ def held_out_errors(
 
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
-    errors = [e[:, 0] for e in _errors(model, trajectories, 1)]
-    whole, inside = np.concatenate(errors), []
-    mean, variance = np.nanmean(whole, 0), np.nanvar(whole, 0)
-    for lag in range(1, CORRELATIONS + 1):
-        pairs = np.concatenate([(e[lag:] - mean) * (e[:-lag] - mean) for e in errors])
-        size = variance * 1.96 * np.sqrt(np.maximum(np.isfinite(pairs).sum(0), 1))
-        inside.append(np.abs(np.nansum(pairs, 0)) <= size)
-    return np.mean(inside, 0)
+    z = _correlations(model, trajectories, CORRELATIONS)
+    return np.mean(np.abs(np.diagonal(z, 0, 1, 2)) <= 1.96, 0)
+
+
+def late_inputs(fit: Fit, trajectories: Sequence[Trajectory]) -> Array:
+    """Return how many rows late inputs act beyond the order's reach, ``(n_y, n_u)``; 0 if none."""
+    steps, n_y = sum(one.steps for one in trajectories), len(fit.model.C)
+    last = max(min(LATEST, steps // len(trajectories) // 2), fit.order + 1)
+    z = np.abs(_correlations(fit.model, trajectories, last)[fit.order :, :, n_y:])
+    _, size = _scale(np.concatenate([one.y.numpy() for one in trajectories]))
+    z[:, np.diag(fit.model.S) < 100 * EXACT * size**2] = 0.0
+    return (z.max(0) > max(SURE, np.sqrt(SEEN * steps))) * (fit.order + 1 + z.argmax(0))
+
+
+def _correlations(model: Innovations, trajectories: Sequence[Trajectory], last: int) -> Array:
+    """Return correlations of residuals with residuals and inputs 1, .., ``last`` rows before.
+
+    They are in standard errors, ``(last, n_y, n_y + n_u)``.
+    """
+    z, n_y, errors = [], len(model.C), _errors(model, trajectories, 1)
+    data = [np.hstack((e[:, 0], x.u.numpy())) for e, x in zip(errors, trajectories, strict=True)]
+    mean = np.nanmean(np.concatenate(data), 0)
+    data = [np.nan_to_num(rows - mean) for rows in data]  # what is missing adds nothing
+    for lag in range(1, last + 1):
+        after = np.concatenate([rows[lag:, :n_y] for rows in data])
+        before = np.concatenate([rows[: max(len(rows) - lag, 0)] for rows in data])
+        size = np.sqrt((after**2).T @ before**2)
+        z.append(after.T @ before / np.where(size > 0, size, 1.0))
+    return np.array(z)
 
 
 def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
@@ -203,7 +224,8 @@ def _errors(model: Innovations, trajectories: Sequence[Trajectory], horizon: int
 def each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
     """Return what ``of`` says of each trajectory's y, u and d; it takes those of equal length."""
     found: dict[int, Any] = {}
-    for places, y, v in batches(data):
+    for places in grouped(len(one.v) for one in data):
+        y, v = map(np.stack, zip(*(data[i] for i in places), strict=True))
         found |= zip(places, of(y, *np.split(v, [model.B.shape[1]], -1)), strict=True)
     return [found[i] for i in range(len(data))]
 
@@ -280,7 +302,7 @@ def _compare(
     if len(orders) == 1 or judged(found)[0].score > np.log(EXACT) + MARGIN:
         for p in feasible if any(orders) else ():
             starts = [_predictor(base, p, max(orders)) for base in bases]
-            shown = min(start.states[0].shape[1] for start in starts)
+            shown = min(states[0].shape[1] for states, *_ in starts)
             for n in orders if len(orders) > 1 else (min(orders[0], shown),):
                 if 0 < n <= shown:
                     pars[n, p] = [_states(start, n) for start in starts]
@@ -444,13 +466,11 @@ def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
     U = np.concatenate([w.reshape(len(w), -1) for w in windows])
     U = np.hstack((np.ones((len(U), 1)), U, U**2))
     after = np.concatenate([np.diff(y[LAST - 1 :, seldom], axis=0) for _, y in use])
-    for i, target in zip(seldom, after.T, strict=True):
-        rest = target - U @ np.linalg.lstsq(U, target, rcond=None)[0]
-        m, left = U.shape[1] - 1, len(U) - U.shape[1]
-        if left > 0:
-            explained = ((target - target.mean()) ** 2).sum() - rest @ rest
-            ratio = explained / max(rest @ rest, TINY) * left / m
-            unmoved[i] = scipy.special.fdtrc(m, left, ratio) > LEVEL
+    m, left = U.shape[1] - 1, len(U) - U.shape[1]
+    if left > 0:
+        rest = np.square(after - U @ np.linalg.lstsq(U, after, rcond=None)[0]).sum(0)
+        ratio = (len(U) * after.var(0) - rest) / np.maximum(rest, TINY) * left / m
+        unmoved[seldom] = scipy.special.fdtrc(m, left, ratio) > LEVEL
     return unmoved & ~unmoved.all()
 
 
@@ -478,17 +498,11 @@ def _runs(data: Sequence[Signals]) -> list[Signals]:
 
 def _filled(data: Sequence[Signals]) -> list[Signals]:
     """Return the trajectories with gaps of outputs up to FILLED rows filled along lines."""
-    filled = []
-    for y, v in data:
-        rows, whole = np.arange(len(y)), y.copy()
-        for i, column in enumerate(y.T):
-            seen = np.flatnonzero(np.isfinite(column))
-            if 1 < len(seen) < len(y):
-                after = np.searchsorted(seen, rows).clip(1, len(seen) - 1)
-                between = (rows > seen[0]) & (rows < seen[-1]) & np.isnan(column)
-                near = between & (seen[after] - seen[after - 1] <= FILLED + 1)
-                whole[near, i] = np.interp(rows[near], seen, column[seen])
-        filled.append(Signals(whole, v))
+    filled = [one._replace(y=one.y.copy()) for one in data]
+    for column in (column for one in filled for column in one.y.T):
+        for i, k in runs(np.isnan(column)):
+            if i > 0 and k < len(column) and k - i <= FILLED:
+                column[i:k] = np.interp(range(i, k), (i - 1, k), column[[i - 1, k]])
     return filled
 
 
@@ -511,16 +525,14 @@ def measured(data: Sequence[Signals], filled: Sequence[Signals]) -> Innovations:
     return Innovations(W[:, :n], W[:, n:], none, np.zeros(n), one, one, S, mean, P0 - S)
 
 
-class _Predictor(NamedTuple):
-    """States of windows of p steps, those that predict the most first, and the steps after."""
+def _predictor(
+    data: Sequence[Signals], lags: int, order: int
+) -> tuple[list[Array], list[Signals], Array]:
+    """Fit an ARX model of ``lags``; decompose its predictions over HORIZONS, or ``order`` steps.
 
-    states: list[Array]
-    after: list[Signals]
-    first: Array
-
-
-def _predictor(data: Sequence[Signals], lags: int, order: int) -> _Predictor:
-    """Fit an ARX model of ``lags``; decompose its predictions over HORIZONS, or ``order`` steps."""
+    Return the states of windows, those that predict the most first, the steps after, and the mean
+    of the first outputs.
+    """
     n_y = data[0].y.shape[1]
     windows, after = [], []
     for y, v in _runs(data):
@@ -540,12 +552,13 @@ def _predictor(data: Sequence[Signals], lags: int, order: int) -> _Predictor:
     _, s, Vh = np.linalg.svd(np.linalg.qr(Z[:, :-1], mode="r") @ G.T, full_matrices=False)
     s = s[s > 1e-9 * s[0]][:order] / np.sqrt(len(Z))
     T = (Vh[: len(s)] / s[:, None]) @ G
-    return _Predictor([z @ T.T for z in windows], after, first)
+    return [z @ T.T for z in windows], after, first
 
 
-def _states(predictor: _Predictor, order: int) -> Noisy:
+def _states(predictor: tuple[list[Array], list[Signals], Array], order: int) -> Noisy:
     """Return the model of the first ``order`` states, by least squares."""
-    X, after, first = [x[:, :order] for x in predictor.states], predictor.after, predictor.first
+    states, after, first = predictor
+    X = [x[:, :order] for x in states]
     F = np.concatenate([y for y, _ in after])
     V = np.concatenate([np.hstack((x[:-1], v)) for x, (_, v) in zip(X, after, strict=True)])
     X1, X0 = np.concatenate([x[1:] for x in X]), np.concatenate(X)
@@ -559,8 +572,7 @@ def _states(predictor: _Predictor, order: int) -> Noisy:
 def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
     """Return the model with the outputs as the first states, and others of unit variance."""
     n, C = len(model.A), model.C
-    xi = [model.estimates(y, v, v[..., :0]).reshape(-1, n) for _, y, v in batches(data)]
-    cov = np.cov(np.concatenate(xi).T, bias=True).reshape(n, n)
+    cov = np.cov(np.concatenate(each(model, data, model.estimates)).T, bias=True).reshape(n, n)
     root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(n))
     _, s, Vh = np.linalg.svd(C @ root)
     hidden = np.linalg.solve(root.T, Vh[int((s > HIDDEN * s[0]).sum()) :].T).T

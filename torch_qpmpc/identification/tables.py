@@ -20,8 +20,9 @@ from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds, shows_tim
 from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory, runs
 
 #: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away, and
-#: so are errors: numbers in two rows or more, but at most the share FEW of them.
-FAR, FEW = 10, 0.05
+#: so are errors: numbers in two rows or more, but at most the share FEW of them. A slow sensor
+#: has a new value in the share OFTEN of every m-th rows.
+FAR, FEW, OFTEN = 10, 0.05, 0.9
 #: The column of a DataFrame's index of times, and the one of an index in a file, by pandas.
 TIME_INDEX, FILE_INDEX = "the index", "Unnamed: 0"
 #: A column's header with its unit, as in ``T [degC]``.
@@ -58,10 +59,10 @@ def read_tables(
     if episode is not None:
         column = _column(frame, episode)
         marks = marks + (column != column.shift()).cumsum().to_numpy()
-    trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)), dt_unit)
     usual = values[(np.abs(values) <= LARGEST).all(1)]
-    if noticed := (*_marked(usual, names), *_dependent(usual, names)):
+    if noticed := (*_marked(usual, names), *_dependent(usual, names), *_repeated(values, y)):
         warnings.warn(f"In this log, {'; '.join(noticed)}.", UserWarning, stacklevel=3)
+    trajectories, dt, note = _split(values, times, marks, (len(y), len(u), len(d)), dt_unit)
     units = {name: x for name, x in units.items() if name in names}
     return Log(trajectories, y, u, d, units, dt, (note, *read, *words, *noticed), dt_unit)
 
@@ -264,6 +265,21 @@ def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
         if few > 1 and not far.any():
             such = f"in {few} rows, such as {column[away.argmax()]:.6g}"
             notes.append(f"{name} is far from all others {such}: replace errors by NaN")
+    return notes
+
+
+def _repeated(values: np.ndarray, outputs: Sequence[str]) -> list[str]:
+    """Replace values that a sensor repeats until every m-th row by NaN, and name it.
+
+    In a plant at rest, outputs repeat as inputs do: these change in other rows.
+    """
+    notes, moves = [], np.flatnonzero(np.diff(values[:, len(outputs) :], axis=0).any(1))
+    for i, name in enumerate(outputs):
+        rows = 1 + np.flatnonzero(np.diff(values[:, i]))  # NaN is no repeat
+        m = int(np.gcd.reduce(np.diff(rows))) if len(rows) > FEWEST else 1
+        if len(rows) * m > OFTEN * len(values) and len({*(moves % m).tolist()}) > 1:
+            values[np.arange(len(values)) % m != rows[0] % m, i] = np.nan
+            notes.append(f"{name} has a new value every {m} rows: its repeats are taken as missing")
     return notes
 
 
