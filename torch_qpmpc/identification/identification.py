@@ -171,8 +171,8 @@ def identify(
             "observation")``. Done flags and the ids of trajectories are respected. A list or lazy
             stack of logs may have different lengths.
         horizon: N, the number of steps of the predictions that are reported.
-        order: the number of states but disturbances, or the most that the log shows (with a warning
-            if that is none); by default held-out errors choose. 0: the outputs, measured exactly.
+        order: the number of states but disturbances, at most what the log shows; by default chosen
+            by held-out errors. Warnings tell of none or longer dead times. 0: the outputs alone.
         n_d: entries of d_k: by default the known signals of a `Log`, and 0 in a TensorDict, where
             they are the first of the entry ``preview``.
         n_x: the number of outputs, the last entries of ``observation``; all of them by default.

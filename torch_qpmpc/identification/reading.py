@@ -22,8 +22,8 @@ def read_log(
     """Read a log of a plant: row k has outputs y_k, the inputs u_k applied until k + 1, and d_k.
 
     A trajectory ends at a gap in ``time``, where ``episode`` changes, and at a row whose input or
-    known signal is missing. Missing outputs, such as of a sensor that answers in some rows only,
-    stay in it as NaN. Its first and last row have an output, and the last one needs no more.
+    known signal is missing. Missing outputs, such as of a sensor that answers or changes in every
+    m-th row only, stay in it as NaN. It begins and ends with an output; its last row needs no more.
 
     Args:
         data: the path of a CSV file, a DataFrame, a mapping of arrays ``(T,)`` or ``(T, n)``, or a
@@ -42,8 +42,8 @@ def read_log(
             with fewer gaps.
 
     Returns:
-        The log. A `UserWarning` names columns that are constant, a linear function of others or
-        marked by a number such as -9999, times that may be read in two ways, and many gaps.
+        The log. A `UserWarning` names columns that are constant, a linear function of others, or
+        with repeats or marks such as -9999 for missing ones, times of two readings, and many gaps.
 
     Raises:
         QPError: a column is missing, named twice, without numbers or with text such as ``1,5`` or
