@@ -1,7 +1,6 @@
 """``task=store``: a `Store` as a task, registered as by a user's script."""
 
 from tests.store import Store, scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.experiment.tasks import Task, register
 
 register(
@@ -10,7 +9,6 @@ register(
         lambda cfg: Store(horizon=cfg.task.horizon),
         lambda cfg, plant: scheme(plant, cfg.task.gamma),
         lambda cfg, plant: scheme(plant, cfg.task.gamma),
-        closed_loop=plant_loop,
         defaults={
             "task": {
                 "horizon": 3,

@@ -29,7 +29,7 @@ from torch_qpmpc.analysis.structure import (
     prediction_form,
 )
 from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
-from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step
 from torch_qpmpc.mpc.riccati import lqr_gain
@@ -202,17 +202,16 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     # Plants, closed loops and resuming
     ("s: got shape (32, 4), expected shape (*batch, 2).", lambda: closed_loop(mpc, pm)),
     ("steps: got 0, expected a whole number >= 1.", lambda: closed_loop(two, pm, steps=0)),
-    ("steps: got 0, expected a whole number >= 1.", lambda: gymnasium_loop(one, pendulum, steps=0)),
+    ("steps: got 0, expected a whole number >= 1.", lambda: closed_loop(one, pendulum, steps=0)),
     ("starts: got 0, expected a whole number >= 1.", lambda: closed_loop(two, pm, starts=0)),
     ("seed: got -1, expected a whole number >= 0 and <", lambda: closed_loop(two, pm, seed=-1)),
-    ("gamma: got 2.0, expected a discount factor in [0,", lambda: closed_loop(two, pm, gamma=2.0)),
+    ("gamma: got 2.0, expected a discount", lambda: closed_loop(two, pm).discounted(2.0)),
     ("policy: got PointMass, expected a function. Pass a", lambda: closed_loop(pm, mpc.policy)),
-    ("physics: got GymnasiumPlant, expected a", lambda: closed_loop(lambda s: s, pendulum)),
-    ("plant: got str, expected a GymnasiumPlant. Use", lambda: gymnasium_loop(one, "Pendulum-v1")),
+    ("plant: got QPMPC, expected a LinearSystem, a Plant or a", lambda: closed_loop(two, mpc)),
     ("num_envs: got True, expected a whole number >= 1.", lambda: PointMassEnv(True)),
     ("max_steps: got 1.5, expected a whole number >= 1.", lambda: PointMassEnv(2, max_steps=1.5)),
     ("dtype: got torch.int64, expected a", lambda: PointMassEnv(2, dtype=torch.int64)),
-    ("physics: got str, expected a LinearSystem.", lambda: PointMassEnv(2, physics="gaussian")),
+    ("plant: got str, expected a LinearSystem.", lambda: PointMassEnv(2, plant="gaussian")),
     (f"seed: got {2**64}, expected a whole", lambda: PointMassEnv(2).set_seed(2**64)),
     ("start_position: got -1.0, expected a finite number", lambda: PointMass(start_position=-1.0)),
     ("start_velocity: got nan, expected a finite number >=", lambda: PointMass(start_velocity=nan)),

@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.config import NonNegative, Positive
@@ -119,7 +118,7 @@ register(
         make_plant,
         wrong_scheme,
         true_scheme,
-        closed_loop=partial(plant_loop, starts=STARTS),
+        starts=STARTS,
         rivals={f"{x} times the action's weight": partial(heavier, factor=x) for x in (10, 30)},
         nominal_scheme=wrong_scheme,
         episode=episode,

@@ -19,7 +19,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.tasks import Task, plant_layout, priced, register
@@ -152,7 +151,6 @@ register(
         "four_tanks",
         make_plant,
         scheme,
-        closed_loop=plant_loop,
         rivals={f"Kalman filter, N = {LONG}": KalmanMPC},
         episode=episode,
         defaults={**OPTIONS, "task": TASK},

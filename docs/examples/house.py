@@ -21,7 +21,6 @@ import torch
 from torch.nn.functional import conv1d, pad
 
 from torch_qpmpc import QPMPC, Bounds, Cost, Model, Scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.config import NonNegative
@@ -189,7 +188,6 @@ register(
         wrong_scheme,
         true_scheme,
         masks,
-        closed_loop=plant_loop,
         rivals={"thermostat with timer": thermostat, "omniscient": Omniscient},
         episode=episode,
         settings=Settings,

@@ -13,14 +13,12 @@ that its prices can follow the expected cost.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torch_qpmpc import Bounds, Cost, Model, Scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, normal
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.tasks import Task, plant_layout, priced, register
@@ -121,7 +119,7 @@ register(
         lambda cfg: Inventory(horizon=cfg.task.horizon),
         wrong_scheme,
         true_scheme,
-        closed_loop=partial(plant_loop, starts=STARTS),
+        starts=STARTS,
         nominal_scheme=wrong_scheme,
         episode=episode,
         defaults={**OPTIONS, "task": TASK},

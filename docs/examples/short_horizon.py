@@ -12,13 +12,11 @@ cost beyond the horizon is what is to be learned.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, Scheme
-from torch_qpmpc.envs.closed_loop import plant_loop
 from torch_qpmpc.envs.linear_system import float64, uniform
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.tasks import Task, plant_layout, plant_scheme, register
@@ -93,7 +91,7 @@ register(
         lambda cfg: TripleIntegrator(horizon=cfg.task.horizon),
         wrong_scheme,
         true_scheme,
-        closed_loop=partial(plant_loop, starts=STARTS),
+        starts=STARTS,
         rivals={f"{HEAVIER:g} times the action's weight": heavier},
         nominal_scheme=wrong_scheme,
         episode=episode,

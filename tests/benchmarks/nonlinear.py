@@ -257,7 +257,7 @@ class Rows(NamedTuple):
             return action
 
         evaluate(self.cfg, timed, physics, outside.EVAL_SEED, starts=1)
-        J = loop.J_discounted if self.plant in CONVERSE else loop.J
+        J = loop.discounted(self.cfg.task.gamma) if self.plant in CONVERSE else loop.J
         row = {"plant": self.plant, "design": design, "seed": self.seed, "J": f"{J:.6g}"}
         row |= {"seconds": f"{np.median(seconds):.3g}", "transitions": transitions} | more
         frame = pd.DataFrame([row], columns=pd.Index(FIELDS))

@@ -43,7 +43,7 @@ import torch_qpmpc as qm
 import train
 from tests.benchmarks.table import DOCS, options_of
 from tests.runs import make_config
-from torch_qpmpc.envs.closed_loop import plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
@@ -385,7 +385,6 @@ for _name, _plant in PLANTS.items():
             f"rivals_{_name.lower()}",
             lambda cfg, plant=_plant: plant,
             own_scheme,
-            closed_loop=plant_loop,
             defaults={**OPTIONS, "task": TASK},
         )
     )
@@ -447,7 +446,7 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
             mpc, model = q_learning(name, size, seed)
             policy = mpc.policy
         seconds, seen = round(time.process_time() - began, 1), plant.observed(model)
-        loop = plant_loop(policy, seen, steps=LONG, starts=LOOPS, seed=EVALUATION + seed)
+        loop = closed_loop(policy, seen, steps=LONG, starts=LOOPS, seed=EVALUATION + seed)
         names = {"plant": name, "transitions": size, "seed": seed, "design": design}
         yield names | {"J": loop.costs.mean().item(), "seconds": seconds, "kept": kept}
 

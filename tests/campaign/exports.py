@@ -17,7 +17,7 @@ from tests.exported import rates, tied
 from tests.runs import make_config
 from torch_qpmpc import QPMPC
 from torch_qpmpc.envs import GrosZanonLTI, LinearSystem, PointMass
-from torch_qpmpc.envs.closed_loop import closed_loop, plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.tasks import make_mpc as make_task_mpc
 from torch_qpmpc.experiment.tasks import make_physics
 from torch_qpmpc.study.runs import FinishedRun
@@ -82,14 +82,15 @@ def house() -> Problem:
     mpc = make_task_mpc(cfg, plant)
 
     def known(rng: np.random.Generator, count: int) -> np.ndarray:
-        loop = plant_loop(
-            lambda p: 12 * torch.rand(len(p), 1).double(), plant, starts=-(-count // 97)
-        )
+        def drawn(p: torch.Tensor) -> torch.Tensor:
+            return 12 * torch.rand(len(p), 1).double()
+
+        loop = closed_loop(drawn, plant, steps=96, starts=-(-count // 97))
         p = loop.known.flatten(0, 1).numpy()[:count]
         p[:, -1] = rng.uniform(8, 26, count)
         return p
 
-    return Problem(mpc, known, lambda policy: plant_loop(policy, plant).known[:-1])
+    return Problem(mpc, known, lambda policy: closed_loop(policy, plant, steps=96).known[:-1])
 
 
 def gros_zanon() -> Problem:

@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from tests.envs.test_kalman_filter import model
 from tests.store import Store
 from torch_qpmpc.envs import GymnasiumPlant, KalmanFilter, PlantEnv, PointMass
-from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop, plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
 K = torch.tensor([[1.5, 0.0, 1.0, 0.0], [0.0, 1.5, 0.0, 1.0]], dtype=torch.float64)
@@ -47,7 +47,7 @@ def test_closed_loop_follows_the_protocol(kind, std):
     assert run.actions.abs().max() == 1, "as applied: clipped"
     assert pytest.approx(costs.sum(0).mean()) == run.J
     discounted = (0.9 ** np.arange(50)[:, None] * costs).sum(0).mean()
-    assert pytest.approx(discounted) == run.J_discounted
+    assert pytest.approx(discounted) == run.discounted(0.9)
 
 
 class Recorded(Store):
@@ -68,7 +68,7 @@ class Recorded(Store):
         return self.given[1]
 
 
-def test_plant_loop_is_an_episode_of_the_environment():
+def test_a_loop_is_an_episode_of_the_environment():
     """Both show a policy the same p, and have the same costs."""
 
     def policy(p: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def test_plant_loop_is_an_episode_of_the_environment():
     data = env.rollout(steps, actor)
     w = env.base_env._signals[data["episode"][:, 0, 0]]
     recorded = Recorded(w, data["state"][:, 0], horizon=2, observer=plant.observer)
-    run = plant_loop(policy, recorded, steps=steps, starts=4, gamma=0.9)
+    run = closed_loop(policy, recorded, steps=steps, starts=4)
     seen = torch.cat((data["preview"], data["observation"]), -1)
     assert torch.equal(run.known[:-1], seen.transpose(0, 1))
     last = data["next"][:, -1]
@@ -93,7 +93,7 @@ def test_plant_loop_is_an_episode_of_the_environment():
     assert torch.equal(run.costs, -data["next", "reward"].squeeze(-1).T)
 
 
-def test_the_seed_determines_signals_and_starts_of_plant_loop():
+def test_the_seed_determines_signals_and_starts_of_a_plant():
     class Rival:
         begun: Any = None
 
@@ -105,7 +105,7 @@ def test_the_seed_determines_signals_and_starts_of_plant_loop():
             return torch.full((3, 1), 2.0).double()
 
     plant, rival = Store(), Rival()
-    run = plant_loop(rival, plant, steps=5, starts=3, seed=7)
+    run = closed_loop(rival, plant, steps=5, starts=3, seed=7)
     rng = np.random.default_rng(7)
     w = plant.signals(rng, 3, 5 + 3 + 1)
     x = plant.starts(rng, 3)
@@ -148,8 +148,8 @@ def swing(s):
     return 4 * s[:, 2:]
 
 
-def test_gymnasium_loop_is_one_episode_of_each_start():
-    run = gymnasium_loop(swing, PENDULUM, steps=30, starts=3, seed=7, gamma=0.9)
+def test_a_loop_in_gymnasium_is_one_episode_of_each_start():
+    run = closed_loop(swing, PENDULUM, steps=30, starts=3, seed=7)
     assert run.states.shape == (31, 3, 3)
     assert run.actions.shape == (30, 3, 1)
     for i in range(3):
@@ -163,12 +163,12 @@ def test_gymnasium_loop_is_one_episode_of_each_start():
             assert run.costs[k, i] == pytest.approx(-float(reward), rel=1e-6)
         env.close()
     assert run.actions.abs().max() == 2, "as applied: clipped"
-    assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.J_discounted)
+    assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.discounted(0.9))
 
 
-def test_the_same_seed_is_the_same_gymnasium_loop():
+def test_the_same_seed_is_the_same_loop_in_gymnasium():
     def costs(seed):
-        return gymnasium_loop(swing, PENDULUM, steps=5, starts=3, seed=seed).costs
+        return closed_loop(swing, PENDULUM, steps=5, starts=3, seed=seed).costs
 
     assert torch.equal(costs(1), costs(1))
     assert torch.equal(costs(1)[:, 1:], costs(2)[:, :2]), "start i is of the seed seed + i"
@@ -192,7 +192,7 @@ class Ends(gymnasium.Env):
 
 @pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
 def test_after_a_termination_nothing_costs_and_nothing_moves(register, steps, reached):
-    run = gymnasium_loop(torch.zeros_like, GymnasiumPlant(register(Ends)), steps=steps, starts=2)
+    run = closed_loop(torch.zeros_like, GymnasiumPlant(register(Ends)), steps=steps, starts=2)
     assert run.states[..., 0].T.tolist() == [reached] * 2
     assert min(steps, 3) == run.J
     assert run.costs[3:].abs().sum() == 0

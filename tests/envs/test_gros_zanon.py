@@ -82,8 +82,8 @@ def test_environments_are_of_5000_steps_with_unbounded_observations():
     far["observation"] += 1e6
     assert env.observation_spec.is_in(far.select(*env.observation_spec.keys()))
     assert isinstance(one.unwrapped, GrosZanonLTIGymEnv)
-    assert isinstance(one.unwrapped.physics, GrosZanonLTI)
-    assert one.unwrapped.physics.w == 100
+    assert isinstance(one.unwrapped.plant, GrosZanonLTI)
+    assert one.unwrapped.plant.w == 100
 
 
 def test_bad_weight_is_an_error():

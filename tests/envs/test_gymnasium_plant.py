@@ -9,7 +9,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from torch_qpmpc.envs import GymnasiumPlant
-from torch_qpmpc.envs.closed_loop import gymnasium_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
 
@@ -99,7 +99,7 @@ def test_episodes_have_the_environments_own_length(register):
     env = plant.vectorised(1, None, seed=0)
     assert env.rollout(9)["next", "done"].flatten().tolist() == [False] * 3 + [True]
     env.close()
-    assert len(gymnasium_loop(lambda s: s[:, :1], plant, starts=2).costs) == 4
+    assert len(closed_loop(lambda s: s[:, :1], plant, starts=2).costs) == 4
 
 
 @pytest.mark.parametrize(("last", "length"), [(3, 3), (1000, 5)])
@@ -107,8 +107,7 @@ def test_a_loop_knows_how_long_its_episodes_last(register, last, length):
     """A policy is asked for actions until the last one ends."""
     plant, asked = GymnasiumPlant(register(Counter, last=last)), []
     policy = lambda s: asked.append(s) or torch.zeros(len(s), 1)  # noqa: E731
-    loop = gymnasium_loop(policy, plant, steps=5, starts=2)
-    assert loop.lengths is not None
+    loop = closed_loop(policy, plant, steps=5, starts=2)
     assert loop.lengths.tolist() == [length] * 2
     assert len(asked) == length
     assert len(loop.costs) == 5
@@ -171,7 +170,7 @@ def test_parts_of_an_observation_become_one_vector(register, kind):
     batch = env.rollout(2)
     env.close()
     assert batch["next", "observation"][0].tolist() == [[1, 2, -0.5], [2, 4, -0.5]]
-    run = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=2, starts=2)
+    run = closed_loop(lambda s: torch.zeros(len(s), 1), plant, steps=2, starts=2)
     assert run.states[-1, 0].tolist() == [2, 4, -0.5]
 
 
@@ -221,7 +220,7 @@ def test_an_observation_of_another_shape_than_its_space_is_an_error(register, st
     plant = GymnasiumPlant(register(Wide))
     match = r"task.id: got an observation of shape \(3,\), expected \(1,\), as in its space"
     with pytest.raises(QPError, match=match):
-        gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=3, starts=2)
+        closed_loop(lambda s: torch.zeros(len(s), 1), plant, steps=3, starts=2)
     with pytest.raises(QPError, match=match):
         plant.vectorised(2, 3, seed=0).rollout(3)
     assert not plant.raised
@@ -257,14 +256,13 @@ class Fragile(Counter):
 @pytest.mark.parametrize("at", [1, 2, 4])
 def test_an_exception_ends_its_episode_alone(register, at):
     plant = GymnasiumPlant(register(Fragile), at=at)
-    loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
-    assert loop.raised is not None
+    loop = closed_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
     assert loop.raised.tolist() == [False, True] * 2
     assert len(plant.raised) == 2
     assert plant.raised[0].startswith("FloatingPointError: the integrator failed (")
     assert plant.raised[0].split("(")[1].startswith(f"{__file__}, line ")
     assert pytest.approx(10) == loop.J
-    assert loop.J_discounted < 10
+    assert loop.discounted(0.9) < 10
     env = plant.vectorised(2, 5, seed=0)
     batch = env.rollout(12, break_when_any_done=False)
     env.close()
@@ -280,7 +278,7 @@ def test_a_wrong_use_of_an_environment_is_no_fault_of_the_plant(register):
     with pytest.raises(gymnasium.error.ResetNeeded):
         plant.make().step(np.zeros(1, np.float32))
     with pytest.warns(UserWarning, match="The plant ends an episode by FloatingPointError: the in"):
-        gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
+        closed_loop(lambda s: torch.zeros(len(s), 1), plant, steps=5, starts=4, seed=0)
 
 
 def test_one_seed_is_one_set_of_different_episodes():

@@ -137,5 +137,5 @@ def test_environments_are_of_fifty_steps_with_the_papers_bounds():
     assert not env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
     for environment in (env, one.unwrapped):
         assert isinstance(environment, PointMassEnv | PointMassGymEnv)
-        assert isinstance(environment.physics, PointMass)
-        assert environment.physics.std == 0.01
+        assert isinstance(environment.plant, PointMass)
+        assert environment.plant.std == 0.01

@@ -15,7 +15,7 @@ import train
 from tests.runs import SMALL, make_config, run_command
 from tests.stops import stop
 from torch_qpmpc import QPMPC, QPError
-from torch_qpmpc.envs.closed_loop import gymnasium_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import (
@@ -224,7 +224,7 @@ def check_predict(run):
     """Run episodes by ``run.predict``, which holds the filter and the plan."""
     for seed in (5, 6):
         options: Any = {"steps": 9, "starts": 1, "seed": seed}
-        loop = gymnasium_loop(warm_policy(run.policy), run.physics, **options)
+        loop = closed_loop(warm_policy(run.policy), run.physics, **options)
         env = run.physics.make()
         (y, _), costs = env.reset(seed=seed), []
         for k in range(len(loop.costs)):

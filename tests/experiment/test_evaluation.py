@@ -7,7 +7,7 @@ import torch
 
 from tests.runs import SMALL, make_config
 from torch_qpmpc.envs import GymnasiumPlant, Plant
-from torch_qpmpc.envs.closed_loop import gymnasium_loop, plant_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, Policy, zero_action
@@ -27,7 +27,7 @@ def test_the_summary_has_each_J_the_gap_and_the_rivals():
     expected = {"J_start": start, "J_best": learned, "J_final": learned, "J_true_model": true}
     expected["closed_gap"] = (start - learned) / (start - true)
     assert {name: summary[name] for name in expected} == pytest.approx(expected)
-    assert summary["J_discounted_best"] == found.loops["learned"].J_discounted
+    assert summary["J_discounted_best"] == found.loops["learned"].discounted(0.9)
     assert summary["rivals"] == {}
     assert found.lines() == {"start": start, "true model": true}
 
@@ -63,7 +63,7 @@ def test_zero_action_is_the_action_within_the_bounds_nearest_to_zero():
     cfg = make_config(*SMALL, *settings)
     plant = make_physics(cfg)
     assert isinstance(plant, GymnasiumPlant)
-    loop = gymnasium_loop(lambda s: torch.zeros(len(s), 1), plant, steps=10)
+    loop = closed_loop(lambda s: torch.zeros(len(s), 1), plant, steps=10)
     assert rivals_of(cfg, plant) == {ZERO_ACTION: loop.J}
     plant.lb_a = plant.lb_a + 3.0
     assert zero_action(plant)(torch.zeros(2, 3)).tolist() == [[1.0], [1.0]]
@@ -73,6 +73,6 @@ def test_rivals_have_the_disturbances_of_the_learned_policy(rivals):
     cfg = make_config(*STORE, "rivals=[strong]", "eval_seed=4")
     plant = make_physics(cfg)
     assert isinstance(plant, Plant)
-    loop = plant_loop(proportional(5.0), plant, steps=6, seed=4)
+    loop = closed_loop(proportional(5.0), plant, steps=6, seed=4)
     assert rivals_of(cfg, plant) == {"strong": loop.J}
     assert torch.equal(evaluate(cfg, proportional(5.0), plant).costs, loop.costs)

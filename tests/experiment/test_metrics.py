@@ -20,7 +20,8 @@ def evaluation(start: float, learned: float, true: float, **rivals: float) -> Ev
 
     def loop(J: float) -> ClosedLoop:
         costs = torch.full((2, 2), J / 2, dtype=torch.float64)
-        return ClosedLoop(torch.zeros(3, 2, 4), torch.zeros(2, 2, 2), costs, 0.9)
+        ended, failed = torch.full((2,), 2.0), torch.zeros(2, dtype=torch.bool)
+        return ClosedLoop(torch.zeros(3, 2, 4), torch.zeros(2, 2, 2), costs, 4, ended, failed)
 
     cfg, loops = make_config(), {"start": start, "learned": learned, "true model": true}
     return Evaluation(cfg, make_physics(cfg), {name: loop(J) for name, J in loops.items()}, rivals)
@@ -70,8 +71,8 @@ def test_report_logs_the_evaluation(tmp_path):
     loop, truth = found.loops["learned"], found.loops["true model"]
     (row,) = pd.read_csv(tmp_path / "metrics.csv").to_dict("records")
     expected = {"update": 20, "eval/J": loop.J, "eval/J_true_model": truth.J}
-    expected |= {"eval/J_discounted": loop.J_discounted, "eval/closed_gap": summary["closed_gap"]}
-    expected |= {"eval/J_Kalman_filter_N_60": 5.0}
+    expected |= {"eval/J_discounted": loop.discounted(0.9), "eval/J_Kalman_filter_N_60": 5.0}
+    expected |= {"eval/closed_gap": summary["closed_gap"]}
     expected |= {"structure/on": 0, "structure/above": 0.5, "structure/below": 0}
     expected |= {f"structure/{name}": value for name, value in structure_metrics(mpc).items()}
     assert row["structure/causality_defect"] > 0.01

@@ -90,5 +90,5 @@ class GrosZanonLTI(LinearSystem):
 class GrosZanonLTIGymEnv(LinearSystemGymEnv):
     """``torch_qpmpc/GrosZanonLTI-v0``, which never terminates and is truncated at 5000 steps."""
 
-    def __init__(self, physics: GrosZanonLTI | None = None) -> None:
-        super().__init__(GrosZanonLTI() if physics is None else physics)
+    def __init__(self, plant: GrosZanonLTI | None = None) -> None:
+        super().__init__(GrosZanonLTI() if plant is None else plant)

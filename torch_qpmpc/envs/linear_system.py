@@ -57,6 +57,8 @@ def check_rng(rng: Rng) -> None:
 class Actuated:
     """A plant's tensors, with the bounds of its action, ``(n_u,)``."""
 
+    stream: ClassVar[int] = 0  # a seed's stream in TorchRL
+
     lb_a: Tensor
     ub_a: Tensor
 
@@ -140,6 +142,11 @@ class LinearSystem(Actuated, ABC):
             if not (getattr(self, f"lb_{of}") <= getattr(self, f"ub_{of}")).all():
                 raise QPError.expected(f"lb_{of}", f"lb_{of} > ub_{of}", "lower bounds <= upper")
 
+    @property
+    def n_x(self) -> int:
+        """Entries of the state."""
+        return len(self.A)
+
     @abstractmethod
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return L(s, a) ``(*batch,)`` of the current s ``(*batch, n_x)``, a ``(*batch, n_u)``."""
@@ -200,17 +207,17 @@ def checked_action(action: Any, space: gymnasium.Space) -> Tensor:
 
 
 class LinearSystemGymEnv(gymnasium.Env):
-    """A Gymnasium environment of ``physics``, truncated by its registration, never terminated.
+    """A Gymnasium environment of ``plant``, truncated by its registration, never terminated.
 
     Raises:
-        QPError: if ``physics`` is no `LinearSystem`.
+        QPError: if ``plant`` is no `LinearSystem`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
-    def __init__(self, physics: LinearSystem) -> None:
-        check_kind("physics", physics, LinearSystem)
-        self.physics = p = physics
+    def __init__(self, plant: LinearSystem) -> None:
+        check_kind("plant", plant, LinearSystem)
+        self.plant = p = plant
         lb_s, ub_s, lb_a, ub_a = (b.float().numpy() for b in (p.lb_s, p.ub_s, p.lb_a, p.ub_a))
         low, high = (lb_s, ub_s) if p.clips_states else (-np.inf, np.inf)
         self.observation_space = gymnasium.spaces.Box(low, high, lb_s.shape)
@@ -222,7 +229,7 @@ class LinearSystemGymEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode; return its observation, float32 ``(n_x,)``, and no information."""
         super().reset(seed=seed)
-        self._s = self.physics.starts(self.np_random, 1)[0]
+        self._s = self.plant.starts(self.np_random, 1)[0]
         self._nu = torch.zeros_like(self._s)
         return self._s.numpy().astype(np.float32), {}
 
@@ -233,9 +240,9 @@ class LinearSystemGymEnv(gymnasium.Env):
             QPError: the action does not fit or is not finite.
         """
         a = checked_action(action, self.action_space)
-        reward = -self.physics.cost(self._s, a).item()
-        self._nu = self.physics.noise(self._nu, self.physics.draw(self.np_random, 1)[0])
-        self._s = self.physics.step(self._s, a, self._nu)
+        reward = -self.plant.cost(self._s, a).item()
+        self._nu = self.plant.noise(self._nu, self.plant.draw(self.np_random, 1)[0])
+        self._s = self.plant.step(self._s, a, self._nu)
         return self._s.numpy().astype(np.float32), reward, False, False, {}
 
 
@@ -243,42 +250,25 @@ class LinearSystemEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` episodes of a `LinearSystem`, as in `VectorisedEnv`.
 
     The hidden entries are ``state``, ``step_count`` and ``noise``, the last nu ``(num_envs, n_x)``.
-
-    Args:
-        physics: the system.
-        num_envs, max_steps, dtype, device, seed: as in `VectorisedEnv`.
-
-    Raises:
-        QPError: an argument does not fit.
     """
 
-    def __init__(
-        self,
-        physics: LinearSystem,
-        num_envs: int,
-        max_steps: int,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-        seed: int | None = None,
-    ) -> None:
-        check_kind("physics", physics, LinearSystem)
-        super().__init__(num_envs, max_steps, dtype, device, seed)
-        self.physics = p = physics.to(self.device)
-        self.stream = p.stream
-        nu = self._reals(len(p.A))
+    kind: ClassVar[type] = LinearSystem
+
+    def _entries(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        p, nu = self.plant, self._reals(self.plant.n_x)
         s = self._box(p.lb_s, p.ub_s) if p.clips_states else nu
-        self._start({"observation": s}, {"state": nu, "noise": nu}, self._box(p.lb_a, p.ub_a), seed)
+        return {"observation": s}, {"state": nu, "noise": nu}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        s = self.physics.starts(self.rng, self.batch_size[0])
+        s = self.plant.starts(self.rng, self.batch_size[0])
         return self._observed(s, torch.zeros_like(s), self._zero_count())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         s, a = tensordict["state"], tensordict["action"]
-        draw = self.physics.draw(self.rng, self.batch_size[0])
-        nu = self.physics.noise(tensordict["noise"], draw)
-        out = self._observed(self.physics.step(s, a, nu), nu, tensordict["step_count"] + 1)
-        return out.set("reward", -self.physics.cost(s, a).unsqueeze(-1).to(self.dtype))
+        draw = self.plant.draw(self.rng, self.batch_size[0])
+        nu = self.plant.noise(tensordict["noise"], draw)
+        out = self._observed(self.plant.step(s, a, nu), nu, tensordict["step_count"] + 1)
+        return out.set("reward", -self.plant.cost(s, a).unsqueeze(-1).to(self.dtype))
 
     def _observed(self, s: Tensor, nu: Tensor, step_count: Tensor) -> TensorDict:
         s = s.to(self.dtype)

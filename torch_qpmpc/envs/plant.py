@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torch_qpmpc.checks import check_kind, check_whole
+from torch_qpmpc.checks import check_whole
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import Actuated, Rng
 from torch_qpmpc.envs.vectorised import VectorisedEnv
@@ -102,33 +102,18 @@ class PlantEnv(VectorisedEnv):
     It emits the output y as ``observation`` ``(num_envs, n_y)``, and the known signals d_k, ..,
     d_{k+N} as ``preview`` ``(num_envs, (N + 1) n_d)`` if there are any. The seed draws the signals
     of `EPISODES` episodes; each reset chooses one of them at random.
-
-    Args:
-        plant: the plant.
-        num_envs, max_steps, dtype, device, seed: as in `VectorisedEnv`.
-
-    Raises:
-        QPError: an argument does not fit.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        num_envs: int,
-        max_steps: int,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-        seed: int | None = None,
-    ) -> None:
-        check_kind("plant", plant, Plant)
-        super().__init__(num_envs, max_steps, dtype, device, seed)
-        self.plant = p = plant.to(self.device)
+    kind: ClassVar[type] = Plant
+
+    def _entries(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        p = self.plant
         n_x = p.starts(torch.Generator(device=self.rng.device), 1).shape[-1]
         observed = {"observation": self._reals(p.n_y)}
         if p.n_d:
-            observed["preview"] = self._reals((p.horizon + 1) * p.n_d)
+            observed["preview"] = self._reals(p.n_preview)
         hidden = {"state": self._reals(n_x, torch.float64), "episode": self._reals(1, torch.int64)}
-        self._start(observed, hidden, self._box(p.lb_a, p.ub_a), seed)
+        return observed, hidden
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)

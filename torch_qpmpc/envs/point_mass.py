@@ -134,15 +134,15 @@ class PointMass(LinearSystem):
 class PointMassGymEnv(LinearSystemGymEnv):
     """``torch_qpmpc/PointMass-v0``, which never terminates and is truncated at 50 steps."""
 
-    def __init__(self, physics: PointMass | None = None) -> None:
-        super().__init__(PointMass() if physics is None else physics)
+    def __init__(self, plant: PointMass | None = None) -> None:
+        super().__init__(PointMass() if plant is None else plant)
 
 
 class PointMassEnv(LinearSystemEnv):
     """A :class:`LinearSystemEnv` of a `PointMass`.
 
     Args:
-        physics: the system; None for ``PointMass()``.
+        plant: the plant; None for ``PointMass()``.
         num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
 
     Example:
@@ -153,10 +153,8 @@ class PointMassEnv(LinearSystemEnv):
     def __init__(
         self,
         num_envs: int = 8,
-        physics: PointMass | None = None,
+        plant: PointMass | None = None,
         max_steps: int = 50,
         **options: Any,
     ) -> None:
-        super().__init__(
-            PointMass() if physics is None else physics, num_envs, max_steps, **options
-        )
+        super().__init__(PointMass() if plant is None else plant, num_envs, max_steps, **options)

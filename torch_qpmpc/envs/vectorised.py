@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from abc import abstractmethod
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -10,18 +11,19 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torch_qpmpc.checks import check_seed, check_whole
+from torch_qpmpc.checks import check_kind, check_seed, check_whole
 from torch_qpmpc.errors import QPError
 
 
 class VectorisedEnv(EnvBase):
-    """``num_envs`` episodes side by side, without a Python loop; none of them terminates.
+    """``num_envs`` episodes of a plant side by side, without a Python loop; none terminates.
 
     Its only state is the generator. Whatever else a step needs travels in the TensorDict as hidden
     entries beside the observation, ``step_count`` ``(num_envs, 1)`` among them, so that TorchRL's
     merging by mask restarts exactly the episodes that are reset. A policy must not read them.
 
     Args:
+        plant: the plant.
         num_envs: number of episodes run side by side, the batch size.
         max_steps: steps of an episode.
         dtype: dtype of what the environment emits and of the action; the plant stays in float64.
@@ -32,28 +34,28 @@ class VectorisedEnv(EnvBase):
         QPError: an argument does not fit, such as ``num_envs`` or ``max_steps`` below 1.
     """
 
+    #: The class of the plant.
+    kind: ClassVar[type]
+
     def __init__(
         self,
+        plant: Any,
         num_envs: int,
         max_steps: int,
-        dtype: torch.dtype,
-        device: torch.device | str | None,
-        seed: int | None,
+        dtype: torch.dtype = torch.float32,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
     ) -> None:
+        check_kind("plant", plant, self.kind)
         check_whole("num_envs", num_envs, 1)
         check_whole("max_steps", max_steps, 1)
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise QPError.expected("dtype", dtype, "a floating-point torch.dtype")
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
-        self.max_steps, self.dtype, self.stream = max_steps, dtype, 0
+        self.max_steps, self.dtype, self.plant = max_steps, dtype, plant.to(self.device)
         self.rng = torch.Generator(device=self.device or "cpu")
-
-    def _start(
-        self, observed: dict[str, Any], hidden: dict[str, Any], action: Bounded, seed: int | None
-    ) -> None:
-        """Set the specs and the seed; hidden entries are inputs and outputs of a step."""
-        count = self._reals(1, dtype=torch.int64)
-        hidden = {**hidden, "step_count": count}
+        observed, hidden = self._entries()
+        hidden["step_count"] = count = self._reals(1, dtype=torch.int64)
         flags = ("done", "terminated", "truncated")
         flag = Categorical(2, shape=count.shape, dtype=torch.bool, device=self.device)
 
@@ -63,10 +65,14 @@ class VectorisedEnv(EnvBase):
 
         self.state_spec = composite(hidden)
         self.observation_spec = composite({**observed, **hidden})
-        self.action_spec = action
+        self.action_spec = self._box(self.plant.lb_a, self.plant.ub_a)
         self.reward_spec = self._reals(1)
         self.done_spec = composite(dict.fromkeys(flags, flag))
         self.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
+
+    @abstractmethod
+    def _entries(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the specs of what is observed and of what is hidden."""
 
     def _reals(self, size: int, dtype: torch.dtype | None = None) -> Unbounded:
         shape, dtype = torch.Size([*self.batch_size, size]), dtype or self.dtype
@@ -79,7 +85,7 @@ class VectorisedEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             check_seed(seed)
-            self.rng.manual_seed(seed ^ self.stream)
+            self.rng.manual_seed(seed ^ self.plant.stream)
 
     def _zero_count(self) -> Tensor:
         return torch.zeros((*self.batch_size, 1), dtype=torch.int64, device=self.rng.device)

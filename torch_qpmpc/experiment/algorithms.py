@@ -13,7 +13,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchrl.collectors import Collector
 from torchrl.modules import AdditiveGaussianModule
 
-from torch_qpmpc.envs.closed_loop import ClosedLoop
+from torch_qpmpc.envs.closed_loop import SEED, ClosedLoop, closed_loop
 from torch_qpmpc.experiment.config import Config, find_task
 from torch_qpmpc.experiment.logs import without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant
@@ -119,14 +119,12 @@ def evaluate(
     policy: Callable[[Tensor], Tensor],
     physics: AnyPlant,
     seed: int | None = None,
-    **options: int,
+    starts: int | None = None,
 ) -> ClosedLoop:
     """Run ``policy`` in closed loop, with the starts and the noise of a seed, or ``eval_seed``."""
-    seed = cfg.eval_seed if seed is None else seed
-    options |= {} if seed is None else {"seed": seed}
-    return find_task(cfg.task).closed_loop(
-        policy, physics, steps=cfg.task.eval_steps, gamma=cfg.task.gamma, **options
-    )
+    seed = next(x for x in (seed, cfg.eval_seed, SEED) if x is not None)
+    starts = starts or find_task(cfg.task).starts
+    return closed_loop(policy, physics, steps=cfg.task.eval_steps, starts=starts, seed=seed)
 
 
 def make_collector(cfg: Config, physics: AnyPlant, actor: TensorDictModuleBase) -> Collector:

@@ -140,11 +140,13 @@ class Evaluation:
         """
         loops = {"candidate": self.loops["learned"], **self.loops}
         summary: dict[str, Any] = {}
-        for tag, suffix in (("J", ""), ("J_discounted", "_discounted")):
+        J = {name: loop.J for name, loop in loops.items()}
+        discounted = {name: loop.discounted(self.cfg.task.gamma) for name, loop in loops.items()}
+        for suffix, costs in (("", J), ("_discounted", discounted)):
             names = ("start", "learned", "candidate", "true model")
-            start, best, final, true = (getattr(loops.get(name), tag, math.nan) for name in names)
-            summary |= {f"{tag}_start": start, f"{tag}_best": best, f"{tag}_final": final}
-            summary[f"{tag}_true_model"] = true
+            start, best, final, true = (costs.get(name, math.nan) for name in names)
+            summary |= {f"J{suffix}_start": start, f"J{suffix}_best": best}
+            summary |= {f"J{suffix}_final": final, f"J{suffix}_true_model": true}
             summary[f"closed_gap{suffix}"] = closed_gap(start, best, true)
         summary["episode_steps"], summary["episodes"] = loops["learned"].costs.shape
         return summary | {"rivals": dict(self.rivals)}

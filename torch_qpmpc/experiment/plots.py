@@ -61,7 +61,7 @@ def draw_positions(
 def learned_episode_figure(mpc: QPMPC, evaluation: Evaluation) -> Figure:
     """Draw the first episode of the learned policy, and its plans after every half horizon."""
     loop = evaluation.loops["learned"]
-    steps = len(loop.actions) if loop.lengths is None else int(loop.lengths[0])
+    steps = int(loop.lengths[0])
     p, y, u = loop.known[: steps + 1, 0], loop.states[: steps + 1, 0], loop.actions[:steps, 0]
     options = {"times": torch.arange(len(p), dtype=torch.float64), **episode_names(mpc, evaluation)}
     plans = plans_along(mpc, p[:-1], every=max(mpc.horizon // 2, 1))

@@ -22,7 +22,7 @@ from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
 ZERO_ACTION = "zero action"
 #: The name of MPC with the model of all of a run's transitions, a rival of each task.
 IDENTIFICATION = "identification"
-#: Maps p ``(starts, n_p)`` to actions ``(starts, n_u)``; see `plant_loop`.
+#: Maps p ``(starts, n_p)`` to actions ``(starts, n_u)``; see `closed_loop`.
 Policy = Callable[[Tensor], Tensor]
 #: The horizon and the price of a violation of `tightened`.
 HORIZON, SLACK = 10, 100.0

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
 import torch_qpmpc as qm
-from torch_qpmpc.envs.closed_loop import closed_loop, gymnasium_loop
+from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.start import Exploration
 
 
@@ -42,7 +42,7 @@ def start(id: str | None, seed: int) -> Start:
     log = env.rollout(125, module, break_when_any_done=False)
     mpc = qm.QPMPC.from_data(log, 10, gamma=0.98, **options)
     bounds = plant.lb_a.to(env.action_spec.dtype), plant.ub_a.to(env.action_spec.dtype)
-    return Start(env, mpc, lambda policy: gymnasium_loop(policy, plant, starts=8).J, bounds)
+    return Start(env, mpc, lambda policy: closed_loop(policy, plant, starts=8).J, bounds)
 
 
 def options() -> dict[str, Any]:

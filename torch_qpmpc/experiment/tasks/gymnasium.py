@@ -11,7 +11,6 @@ import torch
 from pydantic import AfterValidator
 
 from torch_qpmpc.envs import GymnasiumPlant
-from torch_qpmpc.envs.closed_loop import gymnasium_loop
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config, Count, Matrix, TaskSettings
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
@@ -126,7 +125,6 @@ register(
         "gymnasium",
         make_plant,
         given_scheme,
-        closed_loop=gymnasium_loop,
         rivals={ZERO_ACTION: zero_action},
         settings=GymnasiumSettings,
         defaults=None,

@@ -11,8 +11,8 @@ from hydra.core.config_store import ConfigStore
 from torch import Tensor
 
 from torch_qpmpc.checks import check_kind
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystem, Plant
-from torch_qpmpc.envs.closed_loop import ClosedLoop, closed_loop
+from torch_qpmpc.envs import Plant
+from torch_qpmpc.envs.closed_loop import STARTS, AnyPlant
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings
 from torch_qpmpc.experiment.rivals import Policy, scalar_name
@@ -22,8 +22,6 @@ from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 
-#: A plant of any kind.
-AnyPlant = LinearSystem | GymnasiumPlant | Plant
 #: Names in the metrics that no rival may have.
 TAKEN = {"start", "learned", "candidate", "true_model", "discounted", "final"}
 
@@ -41,7 +39,7 @@ class Task:
             ``start=data`` replaces the model and, if its ``stage_weight`` is None, the cost.
         true_scheme: makes the true scheme, likewise; None if the plant's model is unknown.
         masks: makes, likewise, the masks of parts that are learned only in some entries.
-        closed_loop: the function of `torch_qpmpc.envs.closed_loop` for the plant's kind.
+        starts: the number of closed loops of an evaluation.
         noises: choices of ``noise.name``; the first is the default.
         takes_noise_std: True if ``make_plant`` reads ``noise.std``.
         rivals: functions of a plant that make controllers to compare the learned one with, by name.
@@ -62,7 +60,7 @@ class Task:
     wrong_scheme: Callable[[Config, Any], Scheme]
     true_scheme: Callable[[Config, Any], Scheme] | None = None
     masks: Callable[[Config, Any], Mapping[str, Tensor]] = lambda cfg, plant: {}
-    closed_loop: Callable[..., ClosedLoop] = closed_loop
+    starts: int = STARTS
     noises: tuple[str, ...] = ("none",)
     takes_noise_std: bool = False
     rivals: Mapping[str, Callable[[Any], Policy]] = field(default_factory=dict)
@@ -74,10 +72,7 @@ class Task:
 
 def plant_layout(plant: AnyPlant, horizon: int) -> Layout:
     """Return the sizes of the QP of a plant."""
-    if isinstance(plant, Plant):
-        return Layout(plant.n_x, plant.n_u, horizon, n_d=plant.n_d)
-    n_x = plant.n_x if isinstance(plant, GymnasiumPlant) else len(plant.lb_s)
-    return Layout(n_x, len(plant.lb_a), horizon)
+    return Layout(plant.n_x, len(plant.lb_a), horizon, n_d=getattr(plant, "n_d", 0))
 
 
 def plant_scheme(
