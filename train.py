@@ -54,14 +54,19 @@ from torch_qpmpc.experiment.metrics import (
     table,
     update_metrics,
 )
-from torch_qpmpc.experiment.rivals import IDENTIFICATION
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import restore, snapshot
-from torch_qpmpc.experiment.start import learning_start, make_start, transitions
+from torch_qpmpc.experiment.start import (
+    learning_start,
+    make_start,
+    read_observer,
+    transitions,
+)
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import named_task, run_code
 from torch_qpmpc.files import save_file
 from torch_qpmpc.learning.operators import warm_policy
+from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.mpc.state import KIND
 
 # Absolute, so that a user's script can call main.
@@ -83,21 +88,27 @@ def train(
     torch.set_num_threads(cfg.threads)
 
     # The QP, and J of all that it is compared with.
-    physics = make_physics(cfg)
-    identified = make_start(cfg, physics, folder, written=state is not None, quiet=quiet)
-    physics = physics if identified is None else identified.plant(physics)
-    start = make_mpc(cfg, physics, identified)
-    evaluation = Evaluation.before(cfg, physics, start, quiet)
-    scheme = learning_start(cfg, identified)
-    mpc = start if scheme is identified else make_mpc(cfg, physics, scheme)
+    physics, start = make_physics(cfg), None
+    if state is None:
+        start = make_start(cfg, physics, folder, quiet)
+        physics = physics.observed(None if start is None else start.observer)
+        first = make_mpc(cfg, physics, start)
+        evaluation = Evaluation.before(cfg, physics, first, quiet)
+        evaluation.entries.update({} if start is None else start.summary)
+        scheme = learning_start(cfg, start)
+        mpc = first if scheme is start else make_mpc(cfg, physics, scheme)
+    else:
+        physics = physics.observed(read_observer(folder))
+        evaluation = Evaluation(cfg, physics)
+        first = mpc = QPMPC.of(**state["arguments"])
 
     # The learner: Q-learning of first or second order.
     operator = make_operator(mpc)
     learner = make_learner(cfg, operator)
     replay = make_run_replay(cfg, mpc)
     gate = RunGate(cfg, learner, physics)
-    if state is None and mpc is not start:
-        gate.keep(start)
+    if mpc is not first:
+        gate.keep(first)
 
     # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
@@ -116,19 +127,15 @@ def train(
             for batch in itertools.islice(stream, warm_up):
                 learner.loss_module.observe(batch)
                 replay.extend(batch)
-            if identified is not None and identified.cost is not None and warm_up:
+            if start is not None and start.cost is not None and warm_up:
                 # Its constant is from the log: what random actions cost.
                 run.log({"train/centred": learner.centre(replay)}, 0)
-                if mpc is start:
+                if mpc is first:
                     gate.keep(mpc)
         else:
-            tally = restore(state, mpc, learner, gate, collector, replay)
+            tally = restore(state, mpc, learner, gate, collector, replay, evaluation)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
-            evaluation.evaluate(warm_policy(gate.mpc))
-            # The last checkpoint has no transitions to identify a model from.
-            if J := run.column(f"eval/J_{IDENTIFICATION}")[1]:
-                evaluation.rivals[IDENTIFICATION] = J[-1]
         changed, judged = False, {}  # what is kept, since its last evaluation; the last verdict
         shown: dict[str, str] = {}  # beside the bar
         label = f"{cfg.constraint.name}, {cfg.noise.name}"
@@ -166,13 +173,13 @@ def train(
                     evaluation.evaluate(warm_policy(gate.mpc))
                     changed = False
                 if last:
-                    evaluation.identify(partial(transitions, identified, replay))
+                    evaluation.identify(partial(transitions, cfg, folder, replay))
                 gap = report(run, gate.mpc, evaluation, update)
                 shown["J"], closed = cost_text(gap["J_best"]), gap["closed_gap"]
                 shown |= {"closed_gap": f"{closed:.3f}"} if math.isfinite(closed) else {}
                 progress.set_postfix(shown)
                 run.flush()
-                state = snapshot(cfg, mpc, learner, gate, collector, replay, tally)
+                state = snapshot(cfg, mpc, learner, gate, collector, replay, evaluation, tally)
                 save_file(run.path / CHECKPOINT, KIND, state)
                 gate.save(run.path)
 
@@ -182,7 +189,6 @@ def train(
         if cfg.gate and not judged.get("gate/accepted"):
             evaluation.evaluate(warm_policy(mpc), "candidate")
         summary = run_summary(evaluation, tally, gate)
-        summary |= {} if identified is None else identified.summary
         run.finish(summary)
     if not quiet:
         print(f"\n{table(summary)}\n\n{run.path}")

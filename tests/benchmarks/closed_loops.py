@@ -94,7 +94,7 @@ def he2(seed: int) -> Case:
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log)
-    plant = start.plant(physics)
+    plant = physics.observed(start.observer)
     mpc = make_mpc(cfg, plant, start)
 
     def J() -> float:

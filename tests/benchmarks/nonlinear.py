@@ -277,7 +277,7 @@ def from_log(rows: Rows) -> None:
     torch.manual_seed(rows.seed)
     log = collect_log(rows.cfg, rows.physics)
     start = candidates(rows.cfg, rows.physics, log)[NONLINEAR]
-    plant: Any = start.plant(rows.physics)
+    plant: Any = rows.physics.observed(start.observer)
     transitions = rows.cfg.start.transitions
     mpc: Any = make_mpc(rows.cfg, plant, start)
     model, count = mpc.sequential, []
@@ -315,8 +315,8 @@ def optimum(rows: Rows) -> None:
     if not rows.has(START):
         with tempfile.TemporaryDirectory() as folder:
             torch.manual_seed(rows.seed)
-            start: Any = make_start(rows.cfg, rows.physics, folder, written=False)
-        plant, summary = start.plant(rows.physics), start.summary
+            start: Any = make_start(rows.cfg, rows.physics, folder)
+        plant, summary = rows.physics.observed(start.observer), start.summary
         transitions = rows.cfg.start.transitions + summary["start_transitions"]
         mpc = make_mpc(rows.cfg, plant, start)
         rows.add(START, transitions, lambda: warm_policy(mpc), plant, chosen=summary["start"])

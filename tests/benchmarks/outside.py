@@ -349,12 +349,12 @@ def run(name: str, seed: int) -> dict[str, Any]:
     began = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         torch.manual_seed(seed)
-        start = make_start(cfg, physics, folder, written=False)
+        start = make_start(cfg, physics, folder)
         assert start is not None
     seconds = time.process_time() - began
     policies = {"zero": zero_action(physics), "random": _random(physics, seed)}
     costs = {key: _costs(cfg, physics, policy) for key, policy in policies.items()}
-    plant = start.plant(physics)
+    plant = physics.observed(start.observer)
     costs["start"] = _costs(cfg, plant, warm_policy(make_mpc(cfg, plant, start)))
     excess = costs["start"] - costs["zero"]
     row = {"plant": name, "seed": seed, **{key: x.mean().item() for key, x in costs.items()}}

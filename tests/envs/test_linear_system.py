@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from torch import Tensor
 
 import torch_qpmpc.envs
-from tests.rollouts import Staggered, collected, network_policy
+from tests.rollouts import network_policy
 from torch_qpmpc.envs import (
     GrosZanonLTI,
     LinearSystem,
@@ -33,10 +33,6 @@ IDS = ["torch_qpmpc/PointMass-v0", "torch_qpmpc/GrosZanonLTI-v0"]
 def plant(request: pytest.FixtureRequest) -> LinearSystem:
     """Return each plant in turn, with each kind of noise."""
     return PLANTS[request.param]
-
-
-class StaggeredEnv(Staggered, LinearSystemEnv):
-    """A plant whose episodes start at different steps, so that every later reset is partial."""
 
 
 # --- LinearSystem ------------------------------------------------------------------------------
@@ -114,31 +110,3 @@ def test_torchrl_environment_follows_the_physics(plant):
     assert not data["next", "terminated"].any()
     assert data["next", "truncated"].squeeze(-1).nonzero()[:, 1].tolist() == [49] * 5
     assert torch.equal(data["next", "truncated"], data["next", "done"])
-
-
-def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(plant):
-    data = collected(StaggeredEnv(plant, 8, max_steps=5, seed=2), batches=20, steps=2)
-    done = data["next", "done"].squeeze(-1)
-    assert done.any(0).all(), "every step ends some episode"
-    assert not done.all(0).any(), "no step ends all"
-
-    now, then = data[:, 1:], data[:, :-1]
-    ended = done[:, :-1]
-    for key in ("noise", "step_count"):
-        assert (now[key][ended] == 0).all()
-        assert torch.equal(now[key][~ended], then["next", key][~ended])
-    assert torch.equal(now["observation"][~ended], then["next", "observation"][~ended])
-    assert (
-        not torch.isclose(now["observation"][ended], then["next", "observation"][ended])
-        .all(-1)
-        .any()
-    )
-    assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
-
-    # The stored nu entered the dynamics.
-    following = plant.step(data["observation"], data["action"], data["next", "noise"])
-    torch.testing.assert_close(data["next", "observation"], following.float())
-    if plant is PLANTS["brownian"]:
-        increments = data["next", "noise"] - data["noise"]
-        assert increments.std().item() == pytest.approx(0.1, rel=0.05)
-        assert data["next", "noise"].std().item() > 0.13

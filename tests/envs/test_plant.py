@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.envs.test_kalman_filter import model
-from tests.rollouts import Staggered, collected, network_policy
+from tests.rollouts import network_policy
 from tests.store import Store
 from torch_qpmpc.envs import PlantEnv
 from torch_qpmpc.envs.plant import EPISODES
@@ -17,10 +17,6 @@ PLANT = Store(horizon=3)
 
 def make_env(num_envs: int = 4, max_steps: int = 6, seed: int = 0) -> Any:
     return PlantEnv(PLANT, num_envs, max_steps, torch.float64, seed=seed)
-
-
-class StaggeredEnv(Staggered, PlantEnv):
-    """A plant whose episodes start at different steps, so that every later reset is partial."""
 
 
 def test_sizes_are_those_of_what_a_controller_sees():
@@ -61,21 +57,6 @@ def test_actions_are_clipped():
     following = env.step(td)["next"]
     assert torch.equal(*following["state"])
     assert torch.equal(*following["reward"])
-
-
-def test_partial_resets_restart_exactly_the_finished_episodes():
-    env = StaggeredEnv(PLANT, 6, 5, torch.float64, seed=2)
-    data = collected(env, batches=15, steps=2)
-    done = data["next", "done"].squeeze(-1)
-    assert done.any(0).all(), "every step ends some episode"
-    assert not done.all(0).any(), "no step ends all"
-    now, then, ended = data[:, 1:], data[:, :-1], done[:, :-1]
-    for key in ("observation", "preview", "state", "episode", "step_count"):
-        assert torch.equal(now[key][~ended], then["next", key][~ended]), key
-        assert not torch.equal(now[key][ended], then["next", key][ended]), key
-    assert (now["step_count"][ended] == 0).all()
-    assert (now["state"][ended][:, 1] == 0).all()
-    assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
 
 
 def test_bad_arguments_are_an_error():

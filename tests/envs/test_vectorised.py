@@ -10,7 +10,7 @@ import torch
 from torchrl.envs import ObservationNorm, SerialEnv, TransformedEnv, check_env_specs
 
 from tests.envs.test_kalman_filter import model
-from tests.rollouts import network_policy
+from tests.rollouts import Staggered, collected, network_policy
 from tests.store import Store
 from torch_qpmpc.envs import (
     GrosZanonLTI,
@@ -103,6 +103,46 @@ def test_saved_generator_continues_the_stream(make):
     for one in (other, env):
         one.rng.set_state(state)
         assert torch.equal(rollout(copy.deepcopy(one)), expected)
+
+
+class StaggeredSystem(Staggered, LinearSystemEnv):
+    """Episodes that start at different steps, so that every later reset is partial."""
+
+
+class StaggeredPlant(Staggered, PlantEnv):
+    """The same of a plant with previews."""
+
+
+@pytest.mark.parametrize(
+    ("kind", "plant", "begun"),
+    [
+        (StaggeredSystem, PointMass("gaussian", noise_std=0.1), "noise"),
+        (StaggeredSystem, PointMass("brownian", noise_std=0.1), "noise"),
+        (StaggeredSystem, GrosZanonLTI(), "noise"),
+        (StaggeredPlant, Store(horizon=3), "pump"),
+    ],
+)
+def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(kind, plant, begun):
+    env = kind(plant, 8, 5, torch.float64, seed=2)
+    data = collected(env, batches=20, steps=2)
+    done = data["next", "done"].squeeze(-1)
+    assert done.any(0).all(), "every step ends some episode"
+    assert not done.all(0).any(), "no step ends all"
+    now, then, ended = data[:, 1:], data[:, :-1], done[:, :-1]
+    for key in env.observation_spec:
+        assert torch.equal(now[key][~ended], then["next", key][~ended]), key
+        assert not torch.isclose(now[key][ended], then["next", key][ended]).all(-1).any(), key
+    assert (now["step_count"][ended] == 0).all()
+    first = now["state"][..., 1] if begun == "pump" else now["noise"]
+    assert (first[ended] == 0).all()
+    assert ((now["collector", "traj_ids"] != then["collector", "traj_ids"]) == ended).all()
+    if begun == "noise":
+        following = plant.step(data["observation"], data["action"], data["next", "noise"])
+        assert torch.equal(data["next", "observation"], following), "the stored nu entered it"
+    if getattr(plant, "noise_kind", "") == "brownian":
+        increments = data["next", "noise"] - data["noise"]
+        assert increments.std().item() == pytest.approx(0.1, rel=0.05)
+        assert data["next", "noise"].std().item() > 0.13
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.rivals import IDENTIFICATION
-from torch_qpmpc.experiment.start import collect_log, transitions
+from torch_qpmpc.experiment.start import collect_log, make_start, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start, nominal_mpcs
 from torch_qpmpc.identification.identification import identify
@@ -65,18 +65,18 @@ def test_a_cost_that_the_task_lacks_is_fitted_to_the_rewards():
     assert_close(regulated.H_f, terminal_riccati(A, B, fitted.W, 1.0, mpc.scheme.layout))
 
 
-def test_all_of_a_runs_transitions_are_used():
+def test_all_of_a_runs_transitions_are_used(tmp_path):
     cfg = make_config(*GROS_ZANON)
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
     replay = Replay(400, 20, 8, 5, 1)
     ids = log["next", "done"][..., 0].int()
     replay.extend(log.exclude("preview").set(("collector", "traj_ids"), ids))
-    start = identified_start(cfg, physics, log)
-    (stored,) = transitions(None, replay)
+    (stored,) = transitions(make_config("task=gros_zanon"), tmp_path, replay)
     assert_close(stored["observation"][:, -1], log["observation"][:, -1])
-    first, second = transitions(start, replay)
-    assert first is start.log
+    make_start(cfg, physics, tmp_path)
+    first, second = transitions(cfg, tmp_path, replay)
+    assert torch.equal(first["action"], log["action"])
     assert second.shape == (20, 20)
 
 
@@ -111,7 +111,7 @@ def test_logs_of_any_kind_have_a_rival_or_a_reason(order):
     log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log, order)
     assert ("next", "measured") in start.log.keys(True)
-    found = Evaluation(cfg, start.plant(physics), {}, {})
+    found = Evaluation(cfg, physics.observed(start.observer), {}, {})
     flags = [("next", name) for name in ("done", "terminated", "truncated")]
     for rows in range(4):
         few = start.log[:, :rows].exclude(("next", "measured"))

@@ -17,6 +17,8 @@ import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.run_folder import RunFolder, read_config, read_metrics, unwritable
+from torch_qpmpc.files import load_file, save_file
+from torch_qpmpc.mpc.state import KIND
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "runs.md"
 
@@ -131,8 +133,10 @@ def test_a_failed_write_is_reported(tmp_path):
         raise unwritable(tmp_path, error)
 
 
-@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json"])
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv", "summary.json", "checkpoint.pt"])
 def test_a_file_is_as_it_was_when_writing_fails(tmp_path, monkeypatch, name):
+    for update in (1, 2):  # the second checkpoint takes the first one's place
+        save_file(tmp_path / "checkpoint.pt", KIND, {"update": update})
     with RunFolder(tmp_path, make_config()) as run:
         run.log({"eval/J": 1.0}, 1)
         run.finish({"J_final": 1.0})
@@ -144,8 +148,11 @@ def test_a_file_is_as_it_was_when_writing_fails(tmp_path, monkeypatch, name):
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left"), RunFolder(tmp_path, make_config()) as run:
         run.finish({"J_final": 2.0})
+    with pytest.raises(OSError, match="No space left"):
+        save_file(tmp_path / "checkpoint.pt", KIND, {"update": 3})
     assert (tmp_path / name).read_bytes() == before
     assert not list(tmp_path.glob("*.partial"))
+    assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 2
 
 
 def test_the_log_survives_an_interruption(tmp_path):

@@ -41,7 +41,7 @@ def log_of(*settings: str) -> TensorDictBase:
 def start_of(cfg: Config):
     physics: Any = make_physics(cfg)
     start = identified_start(cfg, physics, collect_log(cfg, physics))
-    physics = start.plant(physics)
+    physics = physics.observed(start.observer)
     return physics, start, make_mpc(cfg, physics, start)
 
 
@@ -229,8 +229,7 @@ def test_damaged_logs_are_named(tmp_path):
         elif content is not None:
             torch.save(content, cfg.start.file)
         with pytest.raises(QPError, match=message):
-            make_start(cfg, physics, tmp_path, written=False)
-    (tmp_path / LOG).unlink()
+            make_start(cfg, physics, tmp_path)
     with pytest.raises(QPError, match=r"^log\.pt: got .*log\.pt, which cannot be read .*wrote\.$"):
-        make_start(make_config(*DATA), physics, tmp_path, written=True)
-    assert make_start(make_config(), physics, tmp_path, written=False) is None
+        stored_log(tmp_path / "gone" / LOG)
+    assert make_start(make_config(), physics, tmp_path) is None

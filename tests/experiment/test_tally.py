@@ -53,13 +53,3 @@ def test_seconds_are_split_and_leave_compilation_out(monkeypatch: pytest.MonkeyP
             pass
     assert times == [0, 1, 2]
     assert tally.seconds == 2 - 0.25
-
-
-def test_a_tally_is_restored_from_its_state():
-    tally = Tally()
-    tally.add(batch(-1.0), MOVED)
-    tally.qps.solves = 7
-    twin = Tally()
-    twin.load_state_dict(tally.state_dict())
-    assert twin == tally
-    assert twin.qps is not tally.qps

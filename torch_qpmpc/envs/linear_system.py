@@ -147,6 +147,10 @@ class LinearSystem(Actuated, ABC):
         """Entries of the state."""
         return len(self.A)
 
+    def observed(self, model: object) -> Self:
+        """Return this plant: its state is measured, and needs no ``model`` of an observer."""
+        return self
+
     @abstractmethod
     def cost(self, s: Tensor, a: Tensor) -> Tensor:
         """Return L(s, a) ``(*batch,)`` of the current s ``(*batch, n_x)``, a ``(*batch, n_u)``."""

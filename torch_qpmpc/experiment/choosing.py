@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import pandas as pd
 import torch
@@ -18,7 +18,7 @@ from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start, nonlinear_start
-from torch_qpmpc.files import damaged, write_whole
+from torch_qpmpc.files import write_whole
 from torch_qpmpc.learning.gate import PairedTest
 from torch_qpmpc.learning.operators import warm_policy
 
@@ -76,18 +76,6 @@ class Choice(NamedTuple):
         """Write the table into a run's folder."""
         write_whole(folder / STARTS, self.table.to_csv(index_label="start").encode())
 
-    @classmethod
-    def read(cls, folder: Path) -> Self:
-        """Read the table of a run; raise `QPError` if it is missing or damaged."""
-        file = folder / STARTS
-        try:
-            choice = cls(pd.read_csv(file, index_col="start", float_precision="round_trip"))
-            _ = choice.name, choice.scheme
-        except Exception as error:  # damaged files raise errors of any type
-            want = "the table of starts that a run wrote"
-            raise damaged(file, error, want, "Start a new run.") from error
-        return choice
-
 
 def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
     """Return the starts of a log by name: linear MPC, with each cost of x_N, and nonlinear MPC.
@@ -100,29 +88,24 @@ def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
     if start.cost is not None and cfg.task.hessian != "diagonal":
         with suppress(QPError):  # the model and the cost have no regulator
             regulated = start._replace(riccati=True)
-            make_mpc(cfg, start.plant(physics), regulated)
+            make_mpc(cfg, physics.observed(start.observer), regulated)
             named |= {REGULATOR: regulated, LINEAR: outputs}
     if (nonlinear := nonlinear_start(cfg, physics, outputs)) is not None:
         named[NONLINEAR] = nonlinear
     return named
 
 
-def choose(
-    cfg: Config, physics: AnyPlant, log: Any, quiet: bool = True, choice: Choice | None = None
-) -> Start:
+def choose(cfg: Config, physics: AnyPlant, log: Any, quiet: bool = True) -> Start:
     """Return the best of the `candidates`, or zero action, by closed loops on the plant.
 
     All have the same episodes. The best one then has more of them, beside zero action, until the
-    gate's test decides: it is chosen if it costs less. A run that goes on has made its ``choice``.
+    gate's test decides: it is chosen if it costs less.
     """
     named = candidates(cfg, physics, log)
-    if choice is None:
-        with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
-            choice = _compared(cfg, physics, named, bar)
-    if (start := named.get(choice.scheme)) is None:
-        raise QPError.expected(STARTS, f"{choice.scheme!r}", f"one of {', '.join(named)}")
-    action = zero_action(physics)(physics.lb_a[None])[0]
-    return start._replace(action=action if choice.name == ZERO_ACTION else None, choice=choice)
+    with tqdm(desc="starts", leave=False, disable=quiet or None) as bar:
+        choice = _compared(cfg, physics, named, bar)
+    action = zero_action(physics)(physics.lb_a[None])[0] if choice.name == ZERO_ACTION else None
+    return named[choice.scheme]._replace(action=action, choice=choice)
 
 
 def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any) -> Choice:
@@ -135,7 +118,7 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         nonlocal steps
         bar.set_postfix_str(name)
         start, done = named.get(name), costs.get(name, torch.zeros(0, dtype=torch.float64))
-        plant = physics if start is None else start.plant(physics)
+        plant = physics if start is None else physics.observed(start.observer)
         policy = zero_action(plant) if start is None else warm_policy(make_mpc(cfg, plant, start))
         loop = evaluate(cfg, policy, plant, APART + cfg.seed + len(done), starts=few).costs
         costs[name] = torch.cat((done, loop.sum(0).nan_to_num(torch.inf, torch.inf)))

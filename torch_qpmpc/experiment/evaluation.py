@@ -6,7 +6,7 @@ All have the same starts and disturbances. All but the learned policy are evalua
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -73,13 +73,15 @@ class Evaluation:
             ``candidate`` and the ``true model``.
         rivals: J of the task's rivals by name, after `identify` also of `IDENTIFICATION`.
         missing: why the end of the run lacks a rival or a figure, by name.
+        entries: what summary.json has of a start from data.
     """
 
     cfg: Config
     physics: AnyPlant
-    loops: dict[str, ClosedLoop]
-    rivals: dict[str, float]
+    loops: dict[str, ClosedLoop] = field(default_factory=dict)
+    rivals: dict[str, float] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
+    entries: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def before(cls, cfg: Config, physics: AnyPlant, mpc: QPMPC, quiet: bool = True) -> Evaluation:
@@ -126,6 +128,17 @@ class Evaluation:
         except Exception as error:  # of any type: hours of learning do not end with a figure
             kind = "" if isinstance(error, QPError) else f"{type(error).__name__}: "
             self.missing[name] = printable(kind + str(error).strip().partition("\n")[0])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all but the configuration and the plant, as tensors and plain values."""
+        own = {name: getattr(self, name) for name in ("rivals", "missing", "entries")}
+        return own | {"loops": {name: vars(loop) for name, loop in self.loops.items()}}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Load a `state_dict`."""
+        loops = {name: ClosedLoop(**loop) for name, loop in state["loops"].items()}
+        for name, part in {**state, "loops": loops}.items():
+            getattr(self, name).update(part)
 
     def lines(self) -> dict[str, float]:
         """Return J of the start, the true model and the rivals by name."""

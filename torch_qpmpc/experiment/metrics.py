@@ -128,6 +128,7 @@ def run_summary(evaluation: Evaluation, tally: Tally, gate: RunGate) -> dict[str
     if raised := getattr(physics, "raised", None):
         summary |= {"raised": len(raised), "first_raised": raised[0]}
     summary |= {"missing": dict(evaluation.missing)} if evaluation.missing else {}
+    summary |= evaluation.entries
     return summary | {"canonical_distance": structure_metrics(mpc)["distance_to_mpc"]}
 
 

@@ -20,6 +20,7 @@ from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
 from torch_qpmpc.experiment.config import Config, differences
+from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
@@ -36,6 +37,7 @@ def snapshot(
     gate: RunGate,
     collector: Collector,
     replay: Replay,
+    evaluation: Evaluation,
     tally: Tally,
 ) -> dict[str, Any]:
     """Return the state of a run between two updates, a file of the `KIND` of a QPMPC.
@@ -53,6 +55,7 @@ def snapshot(
         "gate": gate.state_dict(),
         "replay": replay.state_dict() if len(replay) and not finished else None,
         "collector": None if finished else _collector_state(collector),
+        "evaluation": evaluation.state_dict(),
         "tally": tally.state_dict(),
         "rng": torch.get_rng_state(),
     }
@@ -65,6 +68,7 @@ def restore(
     gate: RunGate,
     collector: Collector,
     replay: Replay,
+    evaluation: Evaluation,
 ) -> Tally:
     """Load a `snapshot` into the parts of a new run with the same configuration."""
     tally, schedule = Tally(), vars(learner.scheduler)
@@ -77,6 +81,7 @@ def restore(
         "replay": replay.load_state_dict,
         "collector": partial(_restore_collector, collector),
         "rng": torch.set_rng_state,
+        "evaluation": evaluation.load_state_dict,
         "tally": tally.load_state_dict,
     }
     for name, function in load.items():

@@ -12,9 +12,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.choosing import Choice, choose
+from torch_qpmpc.experiment.choosing import choose
 from torch_qpmpc.experiment.config import Config
-from torch_qpmpc.experiment.logs import without_blow_ups
+from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
 from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
@@ -61,36 +61,33 @@ class Exploration(nn.Module):
 
 
 def make_start(
-    cfg: Config, physics: AnyPlant, folder: str | Path, written: bool, quiet: bool = True
+    cfg: Config, physics: AnyPlant, folder: str | Path, quiet: bool = True
 ) -> Start | None:
     """Identify the start of a run from a log of the plant; None with ``start=model``.
 
-    With ``task.start_episodes`` closed loops choose it. The run's folder keeps the log and the
-    table of the choice, which are read there if the run has ``written`` them before.
+    With ``task.start_episodes`` closed loops choose it. The run's folder keeps the log, the
+    observer and the table of the choice.
     """
     if cfg.start.name != "data":
         return None
     path = Path(folder) / LOG
-    if written:
-        log = stored_log(path)
-    elif cfg.start.file is not None:
+    if cfg.start.file is not None:
         log = stored_log(cfg.start.file, "start.file", FORMAT)
     else:
         log = collect_log(cfg, physics)
     if not cfg.task.start_episodes:
         start = identified_start(cfg, physics, log)
     else:
-        start = choose(cfg, physics, log, quiet, Choice.read(path.parent) if written else None)
-    if not written:
-        buffer = io.BytesIO()
-        torch.save(log.to_dict(), buffer)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, buffer.getbuffer())
-        if start.observer is not None:
-            content = {name: torch.as_tensor(x) for name, x in start.observer._asdict().items()}
-            save_file(path.with_name(OBSERVER), "observer", content)
-        if start.choice is not None:
-            start.choice.write(path.parent)
+        start = choose(cfg, physics, log, quiet)
+    buffer = io.BytesIO()
+    torch.save(log.to_dict(), buffer)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, buffer.getbuffer())
+    if start.observer is not None:
+        content = {name: torch.as_tensor(x) for name, x in start.observer._asdict().items()}
+        save_file(path.with_name(OBSERVER), "observer", content)
+    if start.choice is not None:
+        start.choice.write(path.parent)
     if not quiet:
         print(start)
     return start
@@ -120,15 +117,19 @@ def collect_log(cfg: Config, physics: AnyPlant) -> TensorDict:
     return log.select(*ENTRIES, strict=False)
 
 
-def transitions(start: Start | None, replay: Replay) -> list[TensorDictBase]:
+def transitions(cfg: Config, folder: str | Path, replay: Replay) -> list[TensorDictBase]:
     """Return the logged steps of a run: those that it starts from, and those in its replay."""
     steps, _ = without_blow_ups(replay.steps().select(*ENTRIES, strict=False))
-    return [steps] if start is None else [start.log, steps]
+    if cfg.start.name != "data":
+        return [steps]
+    log, _ = without_blow_ups(stored_log(Path(folder) / LOG))
+    observer = read_observer(folder)
+    return [log if observer is None else estimated(log, observer), steps]
 
 
-def read_observer(folder: Path) -> Innovations | None:
+def read_observer(folder: str | Path) -> Innovations | None:
     """Read the model of a run's observer; None if the run has none."""
-    path = folder / OBSERVER
+    path = Path(folder) / OBSERVER
     if not path.exists():
         return None
     content = load_file(path, "observer", "train.py")

@@ -107,8 +107,7 @@ class FinishedRun:
     @cached_property
     def physics(self) -> AnyPlant:
         """The plant; `QPError` if it takes code that has not run."""
-        plant = make_physics(self.cfg)
-        return plant if isinstance(plant, LinearSystem) else plant.observed(self.observer)
+        return make_physics(self.cfg).observed(self.observer)
 
     @cached_property
     def observer(self) -> Innovations | None:

@@ -77,11 +77,6 @@ class Start(NamedTuple):
         (n, n_u), n_d = self.model.B.shape, self.model.E.shape[1]
         return Layout(n, n_u, self.horizon, n_d=n_d)
 
-    def plant(self, physics: AnyPlant) -> AnyPlant:
-        """Return ``physics``, whose observation is the estimate of this start's observer."""
-        fixed = isinstance(physics, LinearSystem)
-        return physics if fixed else physics.observed(self.observer)
-
     def __str__(self) -> str:
         cut = f"Episodes of the log that blow up, and are cut there: {self.cut}"
         poles = ", ".join(f"{abs(pole):.3g}" for pole in self.model.poles)
@@ -126,7 +121,7 @@ def identified_start(cfg: Config, physics: AnyPlant, log: Any, order: int | None
     steps = estimated(log, fit.model) if observed else log
     observer = fit.model if observed else None
     start = Start(steps, fit.model, cfg.task.horizon, fit.order, observer, cut=cut)
-    scheme = find_task(cfg.task).wrong_scheme(cfg, start.plant(physics))
+    scheme = find_task(cfg.task).wrong_scheme(cfg, physics.observed(observer))
     if scheme.cost.stage_weight is not None:
         return start
     diagonal = cfg.task.hessian == "diagonal"
