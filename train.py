@@ -55,7 +55,7 @@ from torch_qpmpc.experiment.metrics import (
     update_metrics,
 )
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
-from torch_qpmpc.experiment.run_state import restore, snapshot
+from torch_qpmpc.experiment.run_state import RunState
 from torch_qpmpc.experiment.start import (
     learning_start,
     make_start,
@@ -113,7 +113,8 @@ def train(
     # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
     stream = iter(collector)
-    warm_up = warm_up_batches(cfg)
+    warm_up, tally = warm_up_batches(cfg), Tally()
+    parts = RunState(cfg, mpc, learner, gate, collector, replay, evaluation, tally)
 
     with contextlib.ExitStack() as stack:
         stack.callback(collector.shutdown)
@@ -122,7 +123,6 @@ def train(
 
         # Warm up, or resume.
         if state is None:
-            tally = Tally()
             report(run, gate.mpc, evaluation, 0)
             for batch in itertools.islice(stream, warm_up):
                 learner.loss_module.observe(batch)
@@ -133,7 +133,7 @@ def train(
                 if mpc is first:
                     gate.keep(mpc)
         else:
-            tally = restore(state, mpc, learner, gate, collector, replay, evaluation)
+            parts.restore(state)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
                 print("Starting new episodes: the state of the environments is not saved.")
         changed, judged = False, {}  # what is kept, since its last evaluation; the last verdict
@@ -179,8 +179,7 @@ def train(
                 shown |= {"closed_gap": f"{closed:.3f}"} if math.isfinite(closed) else {}
                 progress.set_postfix(shown)
                 run.flush()
-                state = snapshot(cfg, mpc, learner, gate, collector, replay, evaluation, tally)
-                save_file(run.path / CHECKPOINT, KIND, state)
+                save_file(run.path / CHECKPOINT, KIND, parts.snapshot())
                 gate.save(run.path)
 
         gate.save(run.path)

@@ -25,11 +25,8 @@ from omegaconf import OmegaConf, _utils, base, grammar_parser
 import train
 from tests.runs import SMALL, make_config
 from torch_qpmpc.control import exporting
-from torch_qpmpc.experiment.tasks import identified
 from torch_qpmpc.export import comparison, library
-from torch_qpmpc.identification import identification, learned, subspace
-from torch_qpmpc.identification.log import Trajectory
-from torch_qpmpc.learning import closed_loop
+from torch_qpmpc.identification import learned, subspace
 from torch_qpmpc.mpc import stage_cost
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -98,24 +95,6 @@ def quick_configurations() -> Iterator[None]:
             patch.setattr(ImportlibResourcesConfigSource, name, once_a_path(name))
         # No configuration has a mode; Hydra composes it once more to look.
         patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def quick_identifications() -> Iterator[None]:
-    """Fit the same log once: stopped, resumed and undisturbed runs identify the same model."""
-    fit, known = subspace.fit_state_space, {}
-
-    def once(trajectories: Sequence[Trajectory], *options: int | None, **named: int | None) -> Any:
-        data = tuple((x.shape, x.numpy().tobytes()) for one in trajectories for x in one)
-        key = (data, options, subspace.ORDERS, *named.items())
-        if key not in known:
-            known[key] = fit(trajectories, *options, **named)
-        return copy.deepcopy(known[key])
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (subspace, identification, identified, closed_loop):
-            patch.setattr(module, "fit_state_space", once)
         yield
 
 

@@ -8,13 +8,19 @@ import torch
 from tests.runs import SMALL, choices, linear_system, make_config
 from torch_qpmpc import QPActorValueOperator
 from torch_qpmpc.envs.closed_loop import closed_loop
-from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_optimizer, make_penalties
+from torch_qpmpc.experiment.algorithms import evaluate, make_learner, make_penalties
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 
+OTHERS = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25", "si.beta=0.125")
 
-@pytest.mark.parametrize("constraint", choices("constraint"))
-def test_penalties_by_case(constraint):
-    cfg = make_config(f"constraint={constraint}", *SMALL)
+
+@pytest.mark.parametrize(
+    ("constraint", "others"),
+    [*((name, ()) for name in choices("constraint")), ("combined", OTHERS)],
+)
+def test_a_case_has_its_penalties_with_their_weights(constraint, others):
+    own = [f"constraint.{other}" for other in others]
+    cfg = make_config(f"constraint={constraint}", *SMALL, *own)
     mpc = make_mpc(cfg, make_physics(cfg))
     penalties = make_penalties(cfg, mpc)
     deviation, si = penalties.deviation, penalties.si
@@ -23,29 +29,20 @@ def test_penalties_by_case(constraint):
     assert ("C" in mpc.learned) == (constraint != "fixed")
     assert {"H", "c"} <= set(mpc.learned)
     if deviation is not None:
-        assert deviation.C_mask.unique().tolist() == [0, 1e-4, 1]
+        weights = [0.25, 0.5, 2] if others else [0, 1e-4, 1]
+        assert deviation.C_mask.unique().tolist() == weights
         assert torch.equal(deviation.C_0, mpc.C_0)
     if si is not None:
-        assert si.beta == (1.0 if constraint == "identified" else 1e-6)
-
-
-def test_penalties_have_the_configured_weights():
-    overrides = ("deviation.c_1=2", "deviation.c_2=0.5", "deviation.c_3=0.25")
-    names = [f"constraint.{name}" for name in (*overrides, "si.beta=0.125")]
-    cfg = make_config("constraint=combined", *SMALL, *names)
-    penalties = make_penalties(cfg, make_mpc(cfg, make_physics(cfg)))
-    deviation, si = penalties.deviation, penalties.si
-    assert deviation is not None
-    assert deviation.C_mask.unique().tolist() == [0.25, 0.5, 2]
-    assert si is not None
-    assert si.beta == 0.125
+        assert si.beta == (0.125 if others else 1.0 if constraint == "identified" else 1e-6)
 
 
 @pytest.mark.parametrize("name", ["adam", "sgd"])
 def test_optimizer_has_two_rates_that_fall_linearly(name):
+    betas = ["optimizer.betas=[0.5,0.75]"] if name == "adam" else []
     cfg = make_config(
         *SMALL,
         f"optimizer={name}",
+        *betas,
         "optimizer.lr_cost=0.1",
         "optimizer.lr_constraints=0.01",
         "optimizer.final_fraction=0.2",
@@ -56,6 +53,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
     mpc = make_mpc(cfg, make_physics(cfg))
     learner = make_learner(cfg, QPActorValueOperator(mpc))
     optimizer, scheduler = learner.optimizer, learner.scheduler
+    assert optimizer.defaults.get("betas") == ((0.5, 0.75) if name == "adam" else None)
     assert type(optimizer).__name__.lower() == name
     rates = {"H": 0.1, "c": 0.1, "C": 0.01, "ub": 0.01}
     assert {g["name"]: g["lr"] for g in optimizer.param_groups} == rates
@@ -67,12 +65,6 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         factor = 1 - 0.8 * min(update, 8) / 8
         for group in optimizer.param_groups:
             assert group["lr"] == pytest.approx(rates[group["name"]] * factor)
-
-
-def test_optimizer_options():
-    cfg = make_config(*SMALL, "optimizer=adam", "optimizer.betas=[0.5,0.75]")
-    optimizer = make_optimizer(cfg, make_mpc(cfg, make_physics(cfg)))
-    assert optimizer.param_groups[0]["betas"] == (0.5, 0.75)
 
 
 def test_evaluation_is_without_exploration_and_repeatable():

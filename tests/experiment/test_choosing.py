@@ -1,7 +1,5 @@
 """The choice of a start by closed loops, zero action if nothing is better, and its resumption."""
 
-import copy
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -61,23 +59,10 @@ BOUNDED = "task.observation_bounds=true"
 HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
 
-@pytest.fixture(scope="module")
-def known_starts() -> dict[tuple[Any, ...], dict[str, Any]]:
-    return {}
-
-
 @pytest.fixture(autouse=True)
-def _plant(monkeypatch, register, known_starts):
-    """Make the plant a lag, and fit the starts of the same settings and log once."""
-
-    def once(cfg, physics, log):
-        key = repr(cfg), log["observation"].numpy().tobytes()
-        if key not in known_starts:
-            known_starts[key] = candidates(cfg, physics, log)
-        return copy.deepcopy(known_starts[key])
-
+def _plant(register):
+    """Make the plant a lag."""
     register(Lag, name="Lag-v0")
-    monkeypatch.setattr(choosing, "candidates", once)
 
 
 def chosen(*overrides):
@@ -144,11 +129,12 @@ class Certain(Lag):
         return self.y, -(self.y.item() ** 2) - self.price * np.abs(action).item(), False, False, {}
 
 
-def test_equal_episodes_decide_at_once(register):
+@pytest.mark.parametrize(("first", "episodes"), [(8, [8, 8, 8]), (1, [2, 2, 1])])
+def test_equal_episodes_decide_at_once_but_one_alone_does_not(register, first, episodes):
     register(Certain, name="Lag-v0")
-    choice = chosen(*DATA)[-1]
+    choice = chosen(*DATA, f"task.start_episodes={first}")[-1]
     assert choice.name != ZERO_ACTION
-    assert choice.table.episodes.tolist() == [8, 8, 8]
+    assert choice.table.episodes.tolist() == episodes
 
 
 def test_zero_action_is_held_if_nothing_costs_less():
@@ -293,7 +279,6 @@ def swing(register):
 def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_chosen(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(choosing, "candidates", candidates)
     settings = ("task.eval_steps=30", "task.gamma=1.0", "constraint=mpc", "eval_interval=3")
     cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
     run = trained(cfg, whole)
@@ -353,29 +338,3 @@ def test_a_log_without_a_finite_step_is_an_error_with_its_cause(register, plant,
     register(plant, name="Lag-v0")
     with pytest.raises(QPError, match=rf"start: got \d+ episodes without a finite {cause}"):
         chosen(*DATA, f"task.kwargs={{price: {price}}}")
-
-
-def test_one_episode_alone_chooses_no_start(monkeypatch):
-    """Of two policies with costs of one distribution the start is rarely chosen."""
-    rng = np.random.default_rng(0)
-
-    def evaluated(*_: Any, starts: int) -> Any:
-        return SimpleNamespace(costs=torch.as_tensor(rng.normal(10, 3, (1, starts))))
-
-    for name in ("zero_action", "make_mpc", "warm_policy"):
-        monkeypatch.setattr(choosing, name, lambda *_: None)
-    monkeypatch.setattr(choosing, "evaluate", evaluated)
-    bar = SimpleNamespace(set_postfix_str=lambda _: None, update=lambda: None)
-    start, plant = {LINEAR: SimpleNamespace(observer=None)}, SimpleNamespace(observed=str)
-    task = SimpleNamespace(start_episodes=1, eval_steps=1, gamma=0.9)
-    cfg: Any = SimpleNamespace(task=task, seed=1)
-    names = [choosing._compared(cfg, plant, start, bar).name for _ in range(100)]  # pyright: ignore
-    assert names.count(LINEAR) <= 15
-    costs = iter(range(10**6))  # of turns: the start's, then those of zero action
-
-    def cheaper(*_: Any, starts: int) -> Any:
-        return SimpleNamespace(costs=10.0 * (next(costs) % 2) + evaluated(starts=starts).costs)
-
-    monkeypatch.setattr(choosing, "evaluate", cheaper)
-    names = [choosing._compared(cfg, plant, start, bar).name for _ in range(10)]  # pyright: ignore
-    assert names == [LINEAR] * 10, "which costs three deviations less"

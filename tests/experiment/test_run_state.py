@@ -125,17 +125,6 @@ def test_environments_of_gymnasium_start_new_episodes_on_resume(tmp_path, monkey
 # --- What is refused -----------------------------------------------------------------------------
 
 
-def test_a_null_key_of_an_earlier_version_does_not_matter(stopped, whole):
-    state = load_file(stopped / "checkpoint.pt", KIND)
-    state["config"] |= {"release": None}
-    save_file(stopped / "checkpoint.pt", KIND, state)
-    with (stopped / "config.yaml").open("a") as file:
-        file.write("release: null\n")
-    cfg, state = begun(stopped)
-    train.train(cfg, str(stopped), state)
-    assert_same_numbers(stopped, whole)
-
-
 def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     whole = load_file(stopped / "checkpoint.pt", KIND)
     state = {name: part for name, part in whole.items() if name != "config"}
@@ -148,9 +137,7 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
     cfg = make_config(*RUN, "task.horizon=4", "seed=2", "eval_interval=2")
     save_file(stopped / "checkpoint.pt", KIND, whole)
     OmegaConf.save(cfg.model_dump(exclude_unset=True), stopped / "config.yaml")
-    message = (
-        r"checkpoint: got one from a run with seed=1, task.horizon=3, expected config.yaml's seed=2"
-    )
+    message = r"folder: got .* with seed=1, task.horizon=3, expected seed=2, task"
     with pytest.raises(QPError, match=message):
         begun(stopped)
 

@@ -17,7 +17,7 @@ import train
 from tests.runs import CONFIGS, SMALL, make_config, run_command
 from tests.stops import assert_same_numbers, contents
 from torch_qpmpc import QPError
-from torch_qpmpc.envs import PointMass
+from torch_qpmpc.envs import PointMass, PointMassGymEnv
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment import metrics as metrics_of_runs
 from torch_qpmpc.experiment.launch import LOCK, same_command
@@ -292,32 +292,21 @@ SHORT = ("solver=daqp", "updates=3", "eval_interval=3", "warmup_steps=12", "task
 SHORT += ("rivals=false",)
 
 
-class Mass(gymnasium.Env):
-    """The point mass in Gymnasium, which raises, or has rewards of NaN, in a share of its steps."""
-
-    observation_space = Box(-10, 10, (4,))
-    action_space = Box(-1, 1, (2,))
+class Mass(PointMassGymEnv):
+    """Raises, or has rewards of NaN, in a share of its steps."""
 
     def __init__(self, share: float = 0.0, raises: bool = False, after: int = 0) -> None:
+        super().__init__()
         self.share, self.raises, self.after, self.k = share, raises, after, 0
-        self.physics = PointMass()
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.s = self.physics.starts(self.np_random, 1)[0]
-        return self.s.float().numpy(), {}
 
     def step(self, action):
-        a = torch.as_tensor(action)
-        reward = -self.physics.cost(self.s, a).item()
-        nu = self.physics.noise(0 * self.s, self.physics.draw(self.np_random, 1)[0])
-        self.s = self.physics.step(self.s, a, nu)
+        y, reward, *rest = super().step(action)
         self.k += 1
         if self.k > self.after and self.np_random.random() < self.share:
             if self.raises:
                 raise ArithmeticError("the integrator failed")
             reward = float("nan")
-        return self.s.float().numpy(), reward, False, False, {}
+        return y, reward, *rest
 
 
 @pytest.fixture

@@ -41,18 +41,6 @@ def closed_gap(J_start: float, J_final: float, J_true_model: float) -> float:
     return (J_start - J_final) / gap if gap > 0 else math.nan
 
 
-def gap_text(gap: float, J_true_model: float) -> str:
-    """Return a closed gap to three decimals or, if it is nan, the reason.
-
-    Example:
-        >>> gap_text(math.nan, 50.0)
-        'no gap'
-    """
-    if math.isnan(gap):
-        return "no true model" if math.isnan(J_true_model) else "no gap"
-    return f"{gap:.3f}"
-
-
 def cost_text(J: float) -> str:
     """Return a cost with four significant digits, or all digits before the point.
 

@@ -22,8 +22,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config, differences, keys, unknown_key
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, read_config, read_summary, unwritable
-from torch_qpmpc.experiment.run_state import load_state
 from torch_qpmpc.experiment.tasks.code import COMMAND
+from torch_qpmpc.files import load_file
+from torch_qpmpc.mpc.state import KIND
 
 #: The locked file of a run's folder.
 LOCK = ".lock"
@@ -47,15 +48,19 @@ def settled(
             got = f"{folder}, which holds a run without its config.yaml"
             raise QPError.expected("folder", got, "a run's folder, or one without a run", remedy)
         return None, None
-    if changed := differences(read_config(folder).settings, cfg.settings):
+    finished, state = (folder / "summary.json").exists(), None
+    known = [read_config(folder).settings]
+    if (folder / CHECKPOINT).exists() and not finished:
+        state = load_file(folder / CHECKPOINT, KIND, "train.py")
+        if "config" not in state:
+            raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
+        known.append(state["config"])
+    for changed in filter(None, (differences(settings, cfg.settings) for settings in known)):
         then, now = changed
         raise QPError.expected("folder", f"{folder}, which holds a run with {then}", now, remedy)
-    if (folder / "summary.json").exists():
-        return None, read_summary(folder)
-    if (folder / CHECKPOINT).exists():
-        return load_state(folder, cfg), None
-    shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of a run that begins anew
-    return None, None
+    if state is None and not finished:
+        shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of a run that begins anew
+    return state, read_summary(folder) if finished else None
 
 
 def same_command(folder: str | Path) -> str:

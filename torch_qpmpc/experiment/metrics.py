@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from torch import Tensor
 from torch_qpmpc.analysis.report import structure_metrics
 from torch_qpmpc.analysis.structure import distance_by_band
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.evaluation import Evaluation, cost_text, gap_text
+from torch_qpmpc.experiment.evaluation import Evaluation, cost_text
 from torch_qpmpc.experiment.gating import COMPARED, RunGate
 from torch_qpmpc.experiment.plots import learned_episode_figure, summary_figure
 from torch_qpmpc.experiment.rivals import scalar_name
@@ -170,7 +171,10 @@ def table(summary: Mapping[str, Any]) -> str:
     rows = {}
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
         start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "best", "true_model"))
-        share = gap_text(summary[f"closed_gap{tag.removeprefix('J')}"], true)
+        gap = summary[f"closed_gap{tag.removeprefix('J')}"]
+        share = (
+            "no true model" if math.isnan(true) else "no gap" if math.isnan(gap) else f"{gap:.3f}"
+        )
         rows[name] = [*map(cost_text, (start, final, true)), share]
     head = ["start", "learned", "true model", "closed gap"]
     lines = [pd.DataFrame.from_dict(rows, orient="index", columns=head).to_string(col_space=10)]

@@ -110,9 +110,7 @@ def read_config(folder: str | Path) -> Config:
             raise ValueError("it is a list")
         if key := next((key for key, x in flatten(tree).items() if "${" in str(x)), None):
             raise ValueError(f"{key} is an interpolation: write its value")
-        known = Config.model_fields
-        # A null key of an earlier version was off.
-        return Config.of({key: x for key, x in tree.items() if key in known or x is not None})
+        return Config.of(tree)
     except Exception as error:  # damaged files raise errors of any type
         raise damaged(file, error, "the configuration that a run of this version wrote") from error
 

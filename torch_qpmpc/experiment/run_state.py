@@ -7,8 +7,8 @@ environments cannot be saved and start new episodes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -19,100 +19,68 @@ from torchrl.envs import TransformedEnv
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.algorithms import Learner
-from torch_qpmpc.experiment.config import Config, differences
+from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import Evaluation
 from torch_qpmpc.experiment.gating import RunGate
 from torch_qpmpc.experiment.metrics import Tally
-from torch_qpmpc.experiment.run_folder import CHECKPOINT
-from torch_qpmpc.files import load_file
 from torch_qpmpc.learning.replay import Replay
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.state import KIND, stored
+from torch_qpmpc.mpc.state import stored
 
 
-def snapshot(
-    cfg: Config,
-    mpc: QPMPC,
-    learner: Learner,
-    gate: RunGate,
-    collector: Collector,
-    replay: Replay,
-    evaluation: Evaluation,
-    tally: Tally,
-) -> dict[str, Any]:
-    """Return the state of a run between two updates, a file of the `KIND` of a QPMPC.
+@dataclass(frozen=True)
+class RunState:
+    """The parts of a run whose state a checkpoint keeps."""
 
-    After the last update the replay and the collector's state are left out.
-    """
-    finished = tally.update == cfg.updates
-    return {
-        "config": cfg.settings,
-        "update": tally.update,
-        **stored(mpc),  # so that QPMPC.load reads a checkpoint, too
-        "loss_module": learner.loss_module.state_dict(),
-        "optimizer": learner.optimizer.state_dict(),
-        "scheduler": {"last_epoch": learner.scheduler.last_epoch},
-        "gate": gate.state_dict(),
-        "replay": replay.state_dict() if len(replay) and not finished else None,
-        "collector": None if finished else _collector_state(collector),
-        "evaluation": evaluation.state_dict(),
-        "tally": tally.state_dict(),
-        "rng": torch.get_rng_state(),
-    }
+    cfg: Config
+    mpc: QPMPC
+    learner: Learner
+    gate: RunGate
+    collector: Collector
+    replay: Replay
+    evaluation: Evaluation
+    tally: Tally
 
+    @property
+    def _parts(self) -> dict[str, Any]:
+        learner = {"loss_module": self.learner.loss_module, "optimizer": self.learner.optimizer}
+        names = ("mpc", "gate", "replay", "evaluation", "tally")
+        return learner | {name: getattr(self, name) for name in names}
 
-def restore(
-    state: dict[str, Any],
-    mpc: QPMPC,
-    learner: Learner,
-    gate: RunGate,
-    collector: Collector,
-    replay: Replay,
-    evaluation: Evaluation,
-) -> Tally:
-    """Load a `snapshot` into the parts of a new run with the same configuration."""
-    tally, schedule = Tally(), vars(learner.scheduler)
-    load: dict[str, Callable[[Any], object]] = {
-        "loss_module": learner.loss_module.load_state_dict,
-        "mpc": mpc.load_state_dict,
-        "optimizer": learner.optimizer.load_state_dict,
-        "scheduler": lambda part: schedule.update(last_epoch=int(part["last_epoch"])),
-        "gate": gate.load_state_dict,
-        "replay": replay.load_state_dict,
-        "collector": partial(_restore_collector, collector),
-        "rng": torch.set_rng_state,
-        "evaluation": evaluation.load_state_dict,
-        "tally": tally.load_state_dict,
-    }
-    for name, function in load.items():
-        try:
-            if state[name] is not None:
-                function(state[name])
-        except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
-            reason = str(error).strip().partition("\n")[0]
-            got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
-            raise QPError.expected("checkpoint", got, "the state of this run") from error
-    if state["collector"] is None:
-        replay.end_episodes()
-    return tally
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state between two updates, a file that `QPMPC.load` reads, too.
 
+        After the last update the replay and the collector's state are left out.
+        """
+        finished, parts = self.tally.update == self.cfg.updates, self._parts
+        if finished or not len(self.replay):
+            del parts["replay"]
+        own: dict[str, Any] = {"replay": None, "config": self.cfg.settings}
+        own |= {name: part.state_dict() for name, part in parts.items()}
+        own |= {"update": self.tally.update, "rng": torch.get_rng_state()}
+        own |= {"scheduler": {"last_epoch": self.learner.scheduler.last_epoch}}
+        own |= {"collector": None if finished else _collector_state(self.collector)}
+        return stored(self.mpc) | own
 
-def load_state(folder: Path, cfg: Config) -> dict[str, Any]:
-    """Load the last `snapshot` of the run in a folder, which has the configuration ``cfg``.
-
-    Raises:
-        QPError: the file is damaged, or of a run with another configuration.
-    """
-    state = load_file(folder / CHECKPOINT, KIND, "train.py")
-    if "config" not in state:
-        raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
-    if changed := differences(state["config"], cfg.settings):
-        then, now = changed
-        remedy = "A run resumes with its own configuration, from its own checkpoints."
-        raise QPError.expected(
-            "checkpoint", f"one from a run with {then}", f"config.yaml's {now}", remedy
-        )
-    return state
+    def restore(self, state: dict[str, Any]) -> None:
+        """Load a `snapshot` of a run with the same configuration."""
+        schedule = vars(self.learner.scheduler)
+        load: dict[str, Callable[[Any], object]] = {
+            **{name: part.load_state_dict for name, part in self._parts.items()},
+            "scheduler": lambda part: schedule.update(last_epoch=int(part["last_epoch"])),
+            "collector": partial(_restore_collector, self.collector),
+            "rng": torch.set_rng_state,
+        }
+        for name, function in load.items():
+            try:
+                if state[name] is not None:
+                    function(state[name])
+            except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
+                reason = str(error).strip().partition("\n")[0]
+                got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
+                raise QPError.expected("checkpoint", got, "the state of this run") from error
+        if state["collector"] is None:
+            self.replay.end_episodes()
 
 
 def _collector_state(collector: Collector) -> dict[str, Any] | None:
