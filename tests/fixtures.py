@@ -1,10 +1,8 @@
 """The fixtures of all tests; xdist's own process, which runs none, does not import them."""
 
-import copy
 import ctypes
 import functools
 import gc
-import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,12 +13,7 @@ import matplotlib
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
-from hydra._internal.core_plugins.importlib_resources_config_source import (
-    ImportlibResourcesConfigSource,
-)
-from hydra._internal.hydra import Hydra
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf, _utils, base, grammar_parser
 
 import train
 from tests.runs import SMALL, make_config
@@ -77,27 +70,6 @@ def quick_exports() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def quick_configurations() -> Iterator[None]:
-    """Read, find and parse each text of a configuration and each interpolation once."""
-    load = OmegaConf.load
-    of_text = functools.cache(lambda text: load(io.StringIO(text)))
-    parse = functools.cache(grammar_parser.parse)
-
-    def load_once(file: Any) -> Any:
-        return copy.deepcopy(of_text(file.read())) if isinstance(file, io.IOBase) else load(file)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OmegaConf, "load", load_once)
-        for module in (base, _utils):
-            patch.setattr(module, "parse", parse)
-        for name in ("is_config", "is_group"):
-            patch.setattr(ImportlibResourcesConfigSource, name, once_a_path(name))
-        # No configuration has a mode; Hydra composes it once more to look.
-        patch.setattr(Hydra, "get_mode", lambda *_, **__: None)
-        yield
-
-
 @pytest.fixture
 def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fit models, networks and costs roughly: the tests of mpc compare the fits."""
@@ -106,19 +78,6 @@ def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subspace, "LAGS", (2, 10))
     monkeypatch.setattr(subspace, "MANY", 8)
     monkeypatch.setattr(stage_cost, "ITERATIONS", 50)
-
-
-def once_a_path(name: str) -> Callable[[ImportlibResourcesConfigSource, str], bool]:
-    """Return a method of a package's configurations, of which each path is looked up once."""
-    method, known = getattr(ImportlibResourcesConfigSource, name), {}
-
-    def answer(source: ImportlibResourcesConfigSource, config_path: str) -> bool:
-        key = source.path, config_path
-        if key not in known:
-            known[key] = method(source, config_path)
-        return known[key]
-
-    return answer
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -172,9 +172,8 @@ def table(summary: Mapping[str, Any]) -> str:
     for name, tag in (("J", "J"), ("J discounted", "J_discounted")):
         start, final, true = (summary[f"{tag}_{end}"] for end in ("start", "best", "true_model"))
         gap = summary[f"closed_gap{tag.removeprefix('J')}"]
-        share = (
-            "no true model" if math.isnan(true) else "no gap" if math.isnan(gap) else f"{gap:.3f}"
-        )
+        why = "no true model" if math.isnan(true) else "no gap"
+        share = why if math.isnan(gap) else f"{gap:.3f}"
         rows[name] = [*map(cost_text, (start, final, true)), share]
     head = ["start", "learned", "true model", "closed gap"]
     lines = [pd.DataFrame.from_dict(rows, orient="index", columns=head).to_string(col_space=10)]
