@@ -16,7 +16,7 @@ NAMES |= {f"envs.{name}": getattr(torch_qpmpc.envs, name) for name in torch_qpmp
 #: Where a reader starts: these show how they are used.
 CHIEF = ("DeviationPenalty", "GaussNewton", "QPActorValueOperator", "QPMPC", "QPQLearningLoss")
 CHIEF += ("QuadraticProgram", "SystemIdentificationPenalty", "solve_qp", "envs.GymnasiumPlant")
-CHIEF += ("envs.LinearSystem", "envs.PointMassEnv")
+CHIEF += ("envs.LinearSystem", "envs.LinearSystemEnv")
 
 
 def is_ours(thing: Any) -> bool:

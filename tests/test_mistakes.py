@@ -28,7 +28,7 @@ from torch_qpmpc.analysis.structure import (
     one_step_error,
     prediction_form,
 )
-from torch_qpmpc.envs import GymnasiumPlant, PointMass, PointMassEnv, PointMassGymEnv
+from torch_qpmpc.envs import GymnasiumPlant, LinearSystemEnv, PointMass, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step
@@ -208,11 +208,11 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("gamma: got 2.0, expected a discount", lambda: closed_loop(two, pm).discounted(2.0)),
     ("policy: got PointMass, expected a function. Pass a", lambda: closed_loop(pm, mpc.policy)),
     ("plant: got QPMPC, expected a LinearSystem, a Plant or a", lambda: closed_loop(two, mpc)),
-    ("num_envs: got True, expected a whole number >= 1.", lambda: PointMassEnv(True)),
-    ("max_steps: got 1.5, expected a whole number >= 1.", lambda: PointMassEnv(2, max_steps=1.5)),
-    ("dtype: got torch.int64, expected a", lambda: PointMassEnv(2, dtype=torch.int64)),
-    ("plant: got str, expected a LinearSystem.", lambda: PointMassEnv(2, plant="gaussian")),
-    (f"seed: got {2**64}, expected a whole", lambda: PointMassEnv(2).set_seed(2**64)),
+    ("num_envs: got True, expected a whole number >= 1.", lambda: LinearSystemEnv(pm, True)),
+    ("max_steps: got 1.5, expected a whole number >= 1.", lambda: LinearSystemEnv(pm, 2, 1.5)),
+    ("dtype: got torch.int64, expected a", lambda: LinearSystemEnv(pm, dtype=torch.int64)),
+    ("plant: got str, expected a LinearSystem.", lambda: LinearSystemEnv("gaussian", 2)),
+    (f"seed: got {2**64}, expected a whole", lambda: LinearSystemEnv(pm).set_seed(2**64)),
     ("start_position: got -1.0, expected a finite number", lambda: PointMass(start_position=-1.0)),
     ("start_velocity: got nan, expected a finite number >=", lambda: PointMass(start_velocity=nan)),
     ("B: got shape (4, 2), expected shape (3, n_u). Use", lambda: PointMass(A=eye(3))),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_qpmpc.envs import PointMass, PointMassEnv, PointMassGymEnv
+from torch_qpmpc.envs import LinearSystemEnv, PointMass, PointMassGymEnv
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
@@ -101,7 +101,7 @@ def test_random_streams_stay_as_they_were(kind):
     p, nothing = PointMass(kind), torch.zeros(2, 2, dtype=torch.float64)
     torchrl, gym, evaluation = STREAMS[kind]
 
-    env = PointMassEnv(2, p, dtype=torch.float64, seed=0)
+    env = LinearSystemEnv(p, 2, dtype=torch.float64, seed=0)
     data = env.rollout(3, policy=lambda td: td.set("action", nothing))
     np.testing.assert_allclose(data["next", "observation"][:, -1], torchrl, atol=1e-12)
 
@@ -130,12 +130,12 @@ def test_environments_are_of_fifty_steps_with_the_papers_bounds():
     assert one.spec.max_episode_steps == 50
     bound = np.array([2, 2, 10, 10], dtype=np.float32)
     assert one.observation_space == gymnasium.spaces.Box(-bound, bound)
-    env = PointMassEnv()
+    env = LinearSystemEnv(PointMass())
     assert (env.batch_size, env.max_steps) == ((8,), 50)
     far = env.reset()
     far["observation"] += 2 * torch.as_tensor(bound)
     assert not env.observation_spec.is_in(far.select("observation", "noise", "step_count"))
     for environment in (env, one.unwrapped):
-        assert isinstance(environment, PointMassEnv | PointMassGymEnv)
+        assert isinstance(environment, LinearSystemEnv | PointMassGymEnv)
         assert isinstance(environment.plant, PointMass)
         assert environment.plant.std == 0.01

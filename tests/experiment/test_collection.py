@@ -25,9 +25,9 @@ def test_a_collector_explores_about_the_policy_and_carries_active_sets(task, std
     collector: Any = make_collector(cfg, physics, policy)
     torch.manual_seed(0)
     with SolveLog() as log:
-        batches: list[Any] = [batch.clone() for batch, _ in zip(collector, range(6), strict=False)]
+        batches = [batch.clone() for batch, _ in zip(collector, range(6), strict=False)]
     collector.shutdown()
-    data = torch.cat(batches, dim=1)
+    data: Any = torch.cat(batches, dim=1)
     assert data.shape == (50, 18)
     assert POLICY_ACTIVE_SET not in {*data.keys(), *data["next"].keys()}
     assert log.recalled > 0.5 * log.solves

@@ -8,20 +8,20 @@ from tensordict import TensorDictBase
 
 from tests import store
 from tests.rollouts import Staggered, collected
-from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.envs import LinearSystemEnv, PointMass
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.replay import Replay, walk, windows_to_tau
 
 ENVS, N = 8, 4
 
 
-class StaggeredEnv(Staggered, PointMassEnv):
+class StaggeredEnv(Staggered, LinearSystemEnv):
     """A plant whose episodes start, and therefore end, at different steps."""
 
 
 def batches(count: int, steps: int, max_steps: int) -> list[TensorDictBase]:
     """Noiseless ``(ENVS, steps)`` batches, so that the physics can be checked."""
-    env = StaggeredEnv(ENVS, PointMass(noise_std=0.0), max_steps=max_steps, seed=0)
+    env = StaggeredEnv(PointMass(noise_std=0.0), ENVS, max_steps=max_steps, seed=0)
     return [*collected(env, count, steps).split(steps, dim=1)]
 
 
@@ -161,7 +161,7 @@ def test_bad_capacity_is_an_error(capacity):
 
 def noisy(kind: str, seed: int, max_steps: int = 30, count: int = 40) -> TensorDictBase:
     """Return random steps of ``ENVS`` episodes in turn, with an exactly known constant state."""
-    env = PointMassEnv(ENVS, PointMass(noise_kind=kind), max_steps=max_steps, seed=seed)
+    env = LinearSystemEnv(PointMass(noise_kind=kind), ENVS, max_steps=max_steps, seed=seed)
     torch.manual_seed(seed)
     steps = env.rollout(count, break_when_any_done=False)
     for key in ("observation", ("next", "observation")):
@@ -183,7 +183,7 @@ def test_a_random_walk_is_told_from_white_noise_in_any_unit(seed, unit):
 def test_steps_without_noise_or_neighbours_are_no_walk():
     assert not walk(noisy("brownian", 0)[:, :1])
     assert not walk(noisy("brownian", 0)[:1, :8])
-    exact = PointMassEnv(ENVS, PointMass(noise_std=0.0), max_steps=30, seed=0)
+    exact = LinearSystemEnv(PointMass(noise_std=0.0), ENVS, max_steps=30, seed=0)
     assert not walk(exact.rollout(40, break_when_any_done=False))
 
 

@@ -16,7 +16,7 @@ from torch.testing import assert_close
 import torch_qpmpc as qm
 from tests.problems import BRINK, HARD_ROWS, MIXED, SOFT_ROWS, WEAK, known_qp, normal, random_mpc
 from tests.problems import random_states as states
-from torch_qpmpc.envs import PointMass, PointMassEnv
+from torch_qpmpc.envs import LinearSystemEnv, PointMass
 from torch_qpmpc.qp.pipeline import solve
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS, interior_point
@@ -150,7 +150,7 @@ def learned(device: torch.device) -> tuple[Tensor, list[Tensor]]:
     operator = qm.QPActorValueOperator(mpc, active_set_key="active_set")
     loss_module = qm.QPQLearningLoss(operator)
     loss_module.make_value_estimator(gamma=0.9)
-    env = PointMassEnv(num_envs=1)  # its keys, with other numbers
+    env = LinearSystemEnv(PointMass(), num_envs=1)  # its keys, with other numbers
     batch = env.rollout(30, break_when_any_done=False).reshape(-1)
     batch.set("observation", states(30, size=0.5, seed=1))
     batch.set(("next", "observation"), states(30, size=0.5, seed=2))
@@ -181,7 +181,7 @@ def test_a_rollout():
     """Plant, policy and active sets are on the device, and actions are those of the policy."""
     mpc = point_mass(1)[0].to(DEVICE)
     actor = qm.QPActorValueOperator(mpc).get_policy_operator("policy_active_set")
-    env = PointMassEnv(num_envs=8, seed=0, device=DEVICE)
+    env = LinearSystemEnv(PointMass(), seed=0, device=DEVICE)
     with in_tensors(), torch.no_grad():
         rollout = env.rollout(4, actor)
         expected = mpc.policy(rollout["observation"])

@@ -7,7 +7,7 @@ from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
 from torch_qpmpc.envs.plant import Plant, PlantEnv
-from torch_qpmpc.envs.point_mass import PointMass, PointMassEnv, PointMassGymEnv
+from torch_qpmpc.envs.point_mass import PointMass, PointMassGymEnv
 
 __all__ = [
     "GrosZanonLTI",
@@ -20,6 +20,5 @@ __all__ = [
     "Plant",
     "PlantEnv",
     "PointMass",
-    "PointMassEnv",
     "PointMassGymEnv",
 ]

@@ -254,6 +254,11 @@ class LinearSystemEnv(VectorisedEnv):
     """A TorchRL environment of ``num_envs`` episodes of a `LinearSystem`, as in `VectorisedEnv`.
 
     The hidden entries are ``state``, ``step_count`` and ``noise``, the last nu ``(num_envs, n_x)``.
+
+    Example:
+        >>> from torch_qpmpc.envs import PointMass
+        >>> LinearSystemEnv(PointMass(), num_envs=2, seed=0).rollout(3)["observation"].shape
+        torch.Size([2, 3, 4])
     """
 
     kind: ClassVar[type] = LinearSystem

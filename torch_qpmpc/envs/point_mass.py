@@ -1,4 +1,4 @@
-"""The paper's point mass (section "Point-Mass"), with its Gymnasium and TorchRL environments.
+"""The paper's point mass (section "Point-Mass"), with its Gymnasium environment.
 
 s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 """
@@ -6,7 +6,7 @@ s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 from torch_qpmpc.checks import NONNEGATIVE, check_choice, check_number, check_seed, check_tensor
 from torch_qpmpc.envs.linear_system import (
     LinearSystem,
-    LinearSystemEnv,
     LinearSystemGymEnv,
     Rng,
     float64,
@@ -136,25 +135,3 @@ class PointMassGymEnv(LinearSystemGymEnv):
 
     def __init__(self, plant: PointMass | None = None) -> None:
         super().__init__(PointMass() if plant is None else plant)
-
-
-class PointMassEnv(LinearSystemEnv):
-    """A :class:`LinearSystemEnv` of a `PointMass`.
-
-    Args:
-        plant: the plant; None for ``PointMass()``.
-        num_envs, max_steps, options: as in :class:`LinearSystemEnv`.
-
-    Example:
-        >>> PointMassEnv(num_envs=2, seed=0).rollout(3)["observation"].shape
-        torch.Size([2, 3, 4])
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 8,
-        plant: PointMass | None = None,
-        max_steps: int = 50,
-        **options: Any,
-    ) -> None:
-        super().__init__(PointMass() if plant is None else plant, num_envs, max_steps, **options)

@@ -40,8 +40,8 @@ class VectorisedEnv(EnvBase):
     def __init__(
         self,
         plant: Any,
-        num_envs: int,
-        max_steps: int,
+        num_envs: int = 8,
+        max_steps: int = 50,
         dtype: torch.dtype = torch.float32,
         device: torch.device | str | None = None,
         seed: int | None = None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -18,7 +17,6 @@ from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.experiment.rivals import ZERO_ACTION, zero_action
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start, nonlinear_start
-from torch_qpmpc.files import write_whole
 from torch_qpmpc.learning.gate import PairedTest
 from torch_qpmpc.learning.operators import warm_policy
 
@@ -40,24 +38,15 @@ NOTHING = (
 
 
 class Choice(NamedTuple):
-    """The candidates by name, best first, one of them ``chosen``: J, its ``error``, the counts.
+    """The names of the chosen start and of its scheme, with zero action the best linear one's.
 
-    The ``transitions`` are at most the steps of the ``episodes``.
+    The ``table`` has the candidates by name, best first, one of them ``chosen``: J, its ``error``,
+    the counts. The ``transitions`` are at most the steps of the ``episodes``.
     """
 
+    name: str
+    scheme: str
     table: pd.DataFrame
-
-    @property
-    def name(self) -> str:
-        """The name of the chosen start."""
-        chosen: Any = self.table["chosen"]
-        return chosen[chosen].index.item()
-
-    @property
-    def scheme(self) -> str:
-        """The name of the chosen scheme or, with zero action, of the best linear one."""
-        linear = (name for name in self.table.index if name in (LINEAR, REGULATOR))
-        return next(linear) if self.name == ZERO_ACTION else self.name
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -71,10 +60,6 @@ class Choice(NamedTuple):
         count = f"{self.summary['start_transitions']:,} transitions beside the log's"
         lines = [rows, f"Chosen by at most {count}: {self.name}"]
         return "\n".join(lines + [NOTHING] * (self.name == ZERO_ACTION))
-
-    def write(self, folder: Path) -> None:
-        """Write the table into a run's folder."""
-        write_whole(folder / STARTS, self.table.to_csv(index_label="start").encode())
 
 
 def candidates(cfg: Config, physics: AnyPlant, log: Any) -> dict[str, Start]:
@@ -149,4 +134,6 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
         (len(x), J(name), error[name], steps * len(x), name == chosen) for name, x in costs.items()
     ]
     table = pd.DataFrame(rows, [*costs], ["episodes", "J", "error", "transitions", "chosen"])
-    return Choice(table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable"))
+    table = table.sort_values(["episodes", "J"], ascending=[False, True], kind="stable")
+    linear = next(name for name in table.index if name in (LINEAR, REGULATOR))
+    return Choice(chosen, best if better else linear, table)

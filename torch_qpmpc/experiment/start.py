@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.choosing import choose
+from torch_qpmpc.experiment.choosing import STARTS, choose
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant
@@ -87,7 +87,8 @@ def make_start(
         content = {name: torch.as_tensor(x) for name, x in start.observer._asdict().items()}
         save_file(path.with_name(OBSERVER), "observer", content)
     if start.choice is not None:
-        start.choice.write(path.parent)
+        rows = start.choice.table.to_csv(index_label="start")
+        write_whole(path.with_name(STARTS), rows.encode())
     if not quiet:
         print(start)
     return start

@@ -256,7 +256,7 @@ class QPMPC(nn.Module):
 
         Example:
             >>> import torch, torch_qpmpc as qm
-            >>> env = qm.envs.PointMassEnv(num_envs=4, max_steps=50, seed=0)
+            >>> env = qm.envs.LinearSystemEnv(qm.envs.PointMass(), num_envs=4, seed=0)
             >>> log = env.rollout(50)  # random actions
             >>> mpc = qm.QPMPC.from_data(
             ...     log, 10, structure="tied", action_bounds=([-1] * 2, [1] * 2)
