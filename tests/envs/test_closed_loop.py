@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
+from tests.envs.test_gymnasium_plant import Counter
 from tests.envs.test_kalman_filter import model
 from tests.store import Store
 from torch_qpmpc.envs import GymnasiumPlant, KalmanFilter, PlantEnv, PointMass
@@ -162,37 +163,18 @@ def test_a_loop_in_gymnasium_is_one_episode_of_each_start():
             s, reward, *_ = env.step(a)
             assert run.costs[k, i] == pytest.approx(-float(reward), rel=1e-6)
         env.close()
+    other = closed_loop(swing, PENDULUM, steps=30, starts=2, seed=8)
+    assert torch.equal(run.costs[:, 1:], other.costs), "start i is of the seed seed + i"
     assert run.actions.abs().max() == 2, "as applied: clipped"
     assert (0.9 ** np.arange(30) @ run.costs.numpy()).mean() == pytest.approx(run.discounted(0.9))
 
 
-def test_the_same_seed_is_the_same_loop_in_gymnasium():
-    def costs(seed):
-        return closed_loop(swing, PENDULUM, steps=5, starts=3, seed=seed).costs
-
-    assert torch.equal(costs(1), costs(1))
-    assert torch.equal(costs(1)[:, 1:], costs(2)[:, :2]), "start i is of the seed seed + i"
-    assert not torch.equal(costs(1), costs(4))
-
-
-class Ends(gymnasium.Env):
-    """Each step costs 1, and the episode ends when the observation, 0, 1, .., reaches 3."""
-
-    observation_space = gymnasium.spaces.Box(0.0, 10.0, (1,), np.float32)
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        self.k = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.k += 1
-        return np.full(1, self.k, np.float32), -1.0, self.k == 3, False, {}
-
-
 @pytest.mark.parametrize(("steps", "reached"), [(6, [0, 1, 2, 3, 3, 3, 3]), (2, [0, 1, 2])])
 def test_after_a_termination_nothing_costs_and_nothing_moves(register, steps, reached):
-    run = closed_loop(torch.zeros_like, GymnasiumPlant(register(Ends)), steps=steps, starts=2)
+    plant, asked = GymnasiumPlant(register(Counter, last=3)), []
+    policy = lambda s: asked.append(s) or 0 * s  # noqa: E731
+    run = closed_loop(policy, plant, steps=steps, starts=2)
     assert run.states[..., 0].T.tolist() == [reached] * 2
-    assert min(steps, 3) == run.J
-    assert run.costs[3:].abs().sum() == 0
+    assert run.costs[:, 0].tolist() == [1, 2, 3, 0, 0, 0][:steps]
+    assert run.lengths.tolist() == [min(steps, 3)] * 2
+    assert len(asked) == min(steps, 3), "until the last one ends"

@@ -102,43 +102,28 @@ def test_episodes_have_the_environments_own_length(register):
     assert len(closed_loop(lambda s: s[:, :1], plant, starts=2).costs) == 4
 
 
-@pytest.mark.parametrize(("last", "length"), [(3, 3), (1000, 5)])
-def test_a_loop_knows_how_long_its_episodes_last(register, last, length):
-    """A policy is asked for actions until the last one ends."""
-    plant, asked = GymnasiumPlant(register(Counter, last=last)), []
-    policy = lambda s: asked.append(s) or torch.zeros(len(s), 1)  # noqa: E731
-    loop = closed_loop(policy, plant, steps=5, starts=2)
-    assert loop.lengths.tolist() == [length] * 2
-    assert len(asked) == length
-    assert len(loop.costs) == 5
-
-
 def test_unknown_arguments_of_an_environment_are_an_error():
     match = r"task.kwargs: got {'weight': 2}, expected arguments of 'Pendulum-v1'. .* 'weight'"
     with pytest.raises(QPError, match=match):
         GymnasiumPlant("Pendulum-v1", weight=2)
 
 
-def test_actions_are_clipped_and_a_solvers_rounding_is_zero(register):
-    env = GymnasiumPlant(register(Counter)).make()
+@pytest.mark.parametrize(
+    ("most", "dtype"),
+    [(1e-9, np.float64), (2.0, np.float32), (1e6, np.float64), (np.inf, np.float64)],
+)
+def test_actions_in_any_unit_are_clipped_and_a_solvers_rounding_is_zero(register, most, dtype):
+    env = GymnasiumPlant(register(Counter, actions=Box(-most, most, (1,), dtype))).make()
     own: Any = env.unwrapped
     env.reset(seed=0)
-    for action, applied in ((1e-10, 0.0), (-0.5, -0.5), (3.0, 2.0), (-3.0, -1.0)):
-        env.step(np.array([action], np.float32))
-        assert own.action.tolist() == [applied]
-        assert own.action.dtype == np.float32
-
-
-@pytest.mark.parametrize("most", [1e-9, 1e6, np.inf])
-def test_actions_in_any_unit_reach_the_plant(register, most):
-    bounds = Box(-most, most, (1,), np.float64)
-    env = GymnasiumPlant(register(Counter, actions=bounds)).make()
-    own: Any = env.unwrapped
-    env.reset(seed=0)
-    size = most if np.isfinite(most) else 1e-12
-    for share in (0.7, -1e-6):
-        env.step(np.array([share * size]))
-        assert own.action.tolist() == [share * size]
+    size, shares = (most, (0.7, -1e-6, 3.0, -3.0, 1e-10))
+    if most == np.inf:
+        size, shares = 1e-12, (0.7, -1e-6)
+    for share in shares:
+        env.step(np.array([share * size], dtype))
+        applied = size * (0.0 if share == 1e-10 else np.clip(share, -1, 1))
+        assert own.action.item() == pytest.approx(applied, rel=1e-6, abs=0)
+        assert own.action.dtype == dtype
 
 
 @pytest.mark.parametrize("kind", [Dict, Tuple])
@@ -174,8 +159,9 @@ def test_parts_of_an_observation_become_one_vector(register, kind):
     assert run.states[-1, 0].tolist() == [2, 4, -0.5]
 
 
-def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(register):
-    env = GymnasiumPlant(register(Counter)).vectorised(2, 3, seed=0)
+@pytest.mark.parametrize(("last", "flag"), [(1000, "truncated"), (3, "terminated")])
+def test_an_episode_keeps_its_last_observation_and_its_flag(register, last, flag):
+    env = GymnasiumPlant(register(Counter, last=last)).vectorised(2, 3 + (last == 3), seed=0)
     batch = env.rollout(7, break_when_any_done=False)
     env.close()
     assert batch.shape == (2, 7)
@@ -183,9 +169,10 @@ def test_a_truncated_episode_keeps_its_last_observation_and_is_not_terminated(re
     assert before.tolist() == [[0, 1, 2, 0, 1, 2, 0]] * 2
     assert after.tolist() == [[1, 2, 3, 1, 2, 3, 1]] * 2
     ends = [[False, False, True, False, False, True, False]] * 2
-    assert batch["next", "truncated"].squeeze(-1).tolist() == ends
+    assert batch["next", flag].squeeze(-1).tolist() == ends
     assert batch["next", "done"].squeeze(-1).tolist() == ends
-    assert not batch["next", "terminated"].any()
+    other = "terminated" if flag == "truncated" else "truncated"
+    assert not batch["next", other].any()
     assert batch["next", "reward"].squeeze(-1)[0].tolist() == [-1, -2, -3, -1, -2, -3, -1]
 
 
@@ -224,15 +211,6 @@ def test_an_observation_of_another_shape_than_its_space_is_an_error(register, st
     with pytest.raises(QPError, match=match):
         plant.vectorised(2, 3, seed=0).rollout(3)
     assert not plant.raised
-
-
-def test_a_terminated_episode_is_terminated(register):
-    env = GymnasiumPlant(register(Counter, last=2)).vectorised(1, 3, seed=0)
-    batch = env.rollout(4, break_when_any_done=False)
-    env.close()
-    assert batch["next", "terminated"].flatten().tolist() == [False, True, False, True]
-    assert batch["next", "observation"].flatten().tolist() == [1, 2, 1, 2]
-    assert not batch["next", "truncated"].any()
 
 
 class Fragile(Counter):

@@ -38,16 +38,16 @@ class Lag(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float64)
 
-    def __init__(self, gain=1.0, price=0.1):
-        self.gain, self.price = gain, price
+    def __init__(self, gain=1.0, price=0.1, noise=0.1):
+        self.gain, self.price, self.noise = gain, price, noise
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.y = 3 * self.np_random.choice([-1.0, 1.0], 1)
+        self.y = 3 * self.np_random.choice([-1.0, 1.0] if self.noise else [1.0], 1)
         return self.y, {}
 
     def step(self, action):
-        self.y = 0.9 * self.y + self.gain * action + 0.1 * self.np_random.standard_normal(1)
+        self.y = 0.9 * self.y + self.gain * action + self.noise * self.np_random.standard_normal(1)
         cost = self.y.item() ** 2 + self.price * np.abs(action).item()
         return self.y, -cost, False, False, {}
 
@@ -117,22 +117,10 @@ def test_a_start_that_costs_less_than_zero_action_is_chosen():
     assert f"{steps:,} transitions beside the log's" in str(choice)
 
 
-class Certain(Lag):
-    """A lag without chance, whose episodes are equal."""
-
-    def reset(self, *, seed=None, options=None):
-        self.y = np.full(1, 3.0)
-        return self.y, {}
-
-    def step(self, action):
-        self.y = 0.9 * self.y + self.gain * action
-        return self.y, -(self.y.item() ** 2) - self.price * np.abs(action).item(), False, False, {}
-
-
 @pytest.mark.parametrize(("first", "episodes"), [(8, [8, 8, 8]), (1, [2, 2, 1])])
-def test_equal_episodes_decide_at_once_but_one_alone_does_not(register, first, episodes):
-    register(Certain, name="Lag-v0")
-    choice = chosen(*DATA, f"task.start_episodes={first}")[-1]
+def test_equal_episodes_decide_at_once_but_one_alone_does_not(first, episodes):
+    certain = ("task.kwargs={noise: 0.0}", f"task.start_episodes={first}")
+    choice = chosen(*DATA, *certain)[-1]
     assert choice.name != ZERO_ACTION
     assert choice.table.episodes.tolist() == episodes
 
