@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import train
@@ -165,3 +166,30 @@ def test_the_log_survives_an_interruption(tmp_path):
         raise KeyboardInterrupt
     assert pd.read_csv(tmp_path / "metrics.csv")["eval/J"].tolist() == [3.0, 2.0]
     assert not (tmp_path / "summary.json").exists(), "there is none of half a run"
+
+
+def test_damage_of_a_checkpoint_is_named_or_changes_nothing(tmp_path):
+    path, refused = tmp_path / "checkpoint.pt", []
+    save_file(path, KIND, {"C": torch.arange(99.0)})
+    whole = path.read_bytes()
+    # All bytes of the archive's directory at the end, and some of the rest.
+    positions = sorted({*range(0, len(whole), 61), *range(len(whole) - 300, len(whole))})
+    for position in positions:
+        data = bytearray(whole)
+        data[position] ^= 1 << 7
+        path.write_bytes(data)
+        try:
+            found = load_file(path, KIND)
+        except QPError as error:
+            refused.append(str(error))
+        else:
+            assert torch.equal(found["C"], torch.arange(99.0)), position
+    assert len(refused) > len(positions) / 4
+    assert all("which cannot be read" in sentence for sentence in refused)
+    for content in (whole[: len(whole) // 2], whole[:-5], b"", b"not a checkpoint"):
+        path.write_bytes(content)
+        with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which cannot be read"):
+            load_file(path, KIND)
+    path.unlink()
+    with pytest.raises(QPError, match=r"path: got .*checkpoint.pt, which does not exist"):
+        load_file(path, KIND)
