@@ -57,7 +57,6 @@ from torch_qpmpc.experiment.metrics import (
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import RunState
 from torch_qpmpc.experiment.start import (
-    learning_start,
     make_start,
     read_observer,
     transitions,
@@ -95,8 +94,10 @@ def train(
         first = make_mpc(cfg, physics, start)
         evaluation = Evaluation.before(cfg, physics, first, quiet)
         evaluation.entries.update({} if start is None else start.summary)
-        scheme = learning_start(cfg, start)
-        mpc = first if scheme is start else make_mpc(cfg, physics, scheme)
+        mpc = first
+        if start is not None and start.action is not None and cfg.gate:
+            # The gate keeps the held action; without one, what is learned is, from the action on.
+            mpc = make_mpc(cfg, physics, start._replace(action=None))
     else:
         physics = physics.observed(read_observer(folder))
         evaluation = Evaluation(cfg, physics)

@@ -25,7 +25,7 @@ from torch_qpmpc.experiment.choosing import (
 )
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
-from torch_qpmpc.experiment.start import OBSERVER, collect_log, learning_start
+from torch_qpmpc.experiment.start import OBSERVER, collect_log
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.riccati import terminal_riccati
@@ -132,18 +132,19 @@ def test_zero_action_is_held_if_nothing_costs_less():
     plant: Any = physics.observed(start.observer)
     s = 3 * torch.randn(16, plant.n_x, dtype=torch.float64)
     assert make_mpc(cfg, plant, start).policy(s).abs().max() < 1e-12
-    cfg.gate = False
-    assert learning_start(cfg, start) is start
-    cfg.gate = True
-    assert make_mpc(cfg, plant, learning_start(cfg, start)).policy(s).abs().max() > 1e-3
+    assert make_mpc(cfg, plant, start._replace(action=None)).policy(s).abs().max() > 1e-3
 
 
-def test_the_gate_keeps_the_held_action(tmp_path):
-    settings = ("gate=true", "constraint=mpc", "optimizer=gauss_newton", BOUNDED)
+@pytest.mark.parametrize("gate", [True, False])
+def test_the_gate_keeps_the_held_action_and_without_one_learning_starts_from_it(tmp_path, gate):
+    settings = (f"gate={gate}", "constraint=mpc", "optimizer=gauss_newton", BOUNDED)
     cfg = make_config(*HOPELESS, *settings, "eval_interval=4")
     summary = train.train(cfg, str(tmp_path), quiet=True)
     assert summary["start"] == ZERO_ACTION
-    assert summary["J_best"] == summary["J_start"] < summary["J_final"]
+    if gate:
+        assert summary["J_best"] == summary["J_start"] < summary["J_final"]
+    held = FinishedRun(tmp_path).start.policy(torch.ones(4, 1).double()).abs().max() < 1e-9
+    assert held != gate, "what learning starts from"
 
 
 @pytest.mark.parametrize("hessian", ["block", "diagonal"])

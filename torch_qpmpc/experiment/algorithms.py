@@ -71,7 +71,8 @@ def make_learner(cfg: Config, operator: QPActorValueOperator) -> Learner:
     loss_module.make_value_estimator(gamma=cfg.task.gamma)
     penalties = make_penalties(cfg, mpc)
     optimizer: Any = make_optimizer(cfg, mpc)
-    scheduler = make_scheduler(cfg, optimizer)
+    last, updates = cfg.optimizer.final_fraction, cfg.updates
+    scheduler = LambdaLR(optimizer, lambda k: 1 - (1 - last) * min(k / updates, 1))
     make = second_order if isinstance(optimizer, GaussNewton) else first_order
     update = make(mpc, loss_module, optimizer, penalties)
     return Learner(
@@ -106,12 +107,6 @@ def make_optimizer(cfg: Config, mpc: QPMPC) -> torch.optim.Optimizer:
         first, second = options.betas
         return torch.optim.Adam(groups, betas=(first, second))
     return torch.optim.SGD(groups)
-
-
-def make_scheduler(cfg: Config, optimizer: torch.optim.Optimizer) -> LambdaLR:
-    """Make the linear decay of the learning rates."""
-    last, updates = cfg.optimizer.final_fraction, cfg.updates
-    return LambdaLR(optimizer, lambda k: 1 - (1 - last) * min(k / updates, 1))
 
 
 def evaluate(

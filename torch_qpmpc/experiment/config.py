@@ -328,12 +328,3 @@ def flatten(tree: Any, prefix: str = "") -> dict[str, Any]:
         return {prefix: tree}
     pairs = (flatten(value, f"{prefix}.{key}".lstrip(".")) for key, value in tree.items())
     return {key: value for pair in pairs for key, value in pair.items()}
-
-
-def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Return the differing `settings` of both as ``key=value, ..``; None if all are equal."""
-    changed = [key for key in {**then, **now} if then.get(key) != now.get(key)]
-    if not changed:
-        return None
-    before, after = (", ".join(f"{key}={of.get(key)}" for key in changed) for of in (then, now))
-    return before, after

@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.experiment.config import Config, differences, keys, unknown_key
+from torch_qpmpc.experiment.config import Config, keys, unknown_key
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, read_config, read_summary, unwritable
 from torch_qpmpc.experiment.tasks.code import COMMAND
 from torch_qpmpc.files import load_file
@@ -49,15 +49,19 @@ def settled(
             raise QPError.expected("folder", got, "a run's folder, or one without a run", remedy)
         return None, None
     finished, state = (folder / "summary.json").exists(), None
-    known = [read_config(folder).settings]
+    known, own = [read_config(folder).settings], cfg.settings
     if (folder / CHECKPOINT).exists() and not finished:
         state = load_file(folder / CHECKPOINT, KIND, "train.py")
         if "config" not in state:
             raise QPError.expected("checkpoint", "a saved QPMPC", "a run's state")
         known.append(state["config"])
-    for changed in filter(None, (differences(settings, cfg.settings) for settings in known)):
-        then, now = changed
-        raise QPError.expected("folder", f"{folder}, which holds a run with {then}", now, remedy)
+    for settings in known:
+        changed = [key for key in {**settings, **own} if settings.get(key) != own.get(key)]
+        if changed:
+            both = (settings, own)
+            then, now = (", ".join(f"{key}={of.get(key)}" for key in changed) for of in both)
+            got = f"{folder}, which holds a run with {then}"
+            raise QPError.expected("folder", got, now, remedy)
     if state is None and not finished:
         shutil.rmtree(folder / "tensorboard", ignore_errors=True)  # of a run that begins anew
     return state, read_summary(folder) if finished else None

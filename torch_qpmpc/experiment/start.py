@@ -94,16 +94,6 @@ def make_start(
     return start
 
 
-def learning_start(cfg: Config, start: Start | None) -> Start | None:
-    """Return the start that learning begins with: where one holds an action, that of the scheme.
-
-    The gate keeps the action. Without a gate what is learned is kept, from the action on.
-    """
-    if start is None or start.action is None or not cfg.gate:
-        return start
-    return start._replace(action=None)
-
-
 @torch.no_grad()
 def collect_log(cfg: Config, physics: AnyPlant) -> TensorDict:
     """Collect ``cfg.start.transitions`` of `Exploration` in the run's environments."""
