@@ -30,15 +30,15 @@ BUDGET = {
     ".": 416,
     "analysis": 851,
     "control": 4824,  # nonlinear plants
-    "envs": 1410,
-    "experiment": 2839,
+    "envs": 1350,
+    "experiment": 2760,
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2650,
     "mpc": 3844,
     "proofs": 1001,
     "qp": 5297,
-    "study": 585,  # load_run(..).predict, which refinement's second start pays for
+    "study": 584,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.
 RESERVED = {

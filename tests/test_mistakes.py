@@ -7,7 +7,7 @@
 import re
 from collections.abc import Callable
 from functools import partial
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,13 @@ from torch_qpmpc.analysis.structure import (
     one_step_error,
     prediction_form,
 )
-from torch_qpmpc.envs import GymnasiumPlant, LinearSystemEnv, PointMass, PointMassGymEnv
+from torch_qpmpc.envs import (
+    GrosZanonLTI,
+    GymnasiumPlant,
+    LinearSystemEnv,
+    PointMass,
+    PointMassGymEnv,
+)
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.mpc.projections import check_step
@@ -213,6 +219,11 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("dtype: got torch.int64, expected a", lambda: LinearSystemEnv(pm, dtype=torch.int64)),
     ("plant: got str, expected a LinearSystem.", lambda: LinearSystemEnv("gaussian", 2)),
     (f"seed: got {2**64}, expected a whole", lambda: LinearSystemEnv(pm).set_seed(2**64)),
+    ("noise_kind: got 'pink', expected one of gaussian, brownian", lambda: PointMass("pink")),
+    ("noise_std: got -0.1, expected a finite number >= 0", lambda: PointMass(noise_std=-0.1)),
+    ("noise_std: got nan, expected a finite number >= 0", lambda: PointMass(noise_std=nan)),
+    ("w: got -1.0, expected a finite number >= 0", lambda: GrosZanonLTI(-1.0)),
+    ("w: got inf, expected a finite number >= 0", lambda: GrosZanonLTI(inf)),
     ("start_position: got -1.0, expected a finite number", lambda: PointMass(start_position=-1.0)),
     ("start_velocity: got nan, expected a finite number >=", lambda: PointMass(start_velocity=nan)),
     ("B: got shape (4, 2), expected shape (3, n_u). Use", lambda: PointMass(A=eye(3))),

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from torch_qpmpc.envs import GrosZanonLTI, GrosZanonLTIGymEnv, LinearSystemEnv
-from torch_qpmpc.errors import QPError
 
 
 def test_step_cost_and_violation_are_those_of_the_paper():
@@ -84,9 +83,3 @@ def test_environments_are_of_5000_steps_with_unbounded_observations():
     assert isinstance(one.unwrapped, GrosZanonLTIGymEnv)
     assert isinstance(one.unwrapped.plant, GrosZanonLTI)
     assert one.unwrapped.plant.w == 100
-
-
-def test_bad_weight_is_an_error():
-    for w in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(QPError, match=rf"w: got {w}, expected a finite number >= 0"):
-            GrosZanonLTI(w)

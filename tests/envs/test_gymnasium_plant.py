@@ -128,26 +128,16 @@ def test_actions_in_any_unit_are_clipped_and_a_solvers_rounding_is_zero(register
 
 @pytest.mark.parametrize("kind", [Dict, Tuple])
 def test_parts_of_an_observation_become_one_vector(register, kind):
-    class Parts(Counter):
+    class Parts(gymnasium.ObservationWrapper):
         def __init__(self, **_) -> None:
-            super().__init__()
+            super().__init__(Counter())
             level, age = Box(0.0, 9.0, (2,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
-            self.observation_space: Any = (
-                Dict(level=level, age=age) if kind is Dict else Tuple((level, age))
-            )
+            named, plain = Dict(level=level, age=age), Tuple((level, age))
+            self.observation_space = named if kind is Dict else plain
 
-        def observe(self) -> Any:
-            level = np.array([self.k, 2 * self.k], np.float32)
-            age = np.full(1, -0.5, np.float32)
+        def observation(self, observation) -> Any:
+            level, age = observation * np.array([1, 2], np.float32), np.full(1, -0.5, np.float32)
             return {"age": age, "level": level} if kind is Dict else (level, age)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return self.observe(), {}
-
-        def step(self, action):
-            _, *rest = super().step(action)
-            return self.observe(), *rest
 
     plant = GymnasiumPlant(register(Parts))
     assert plant.ub_s.tolist() == [9, 9, 1]

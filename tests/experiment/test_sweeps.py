@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.runs import SMALL, ended, run_command
-from torch_qpmpc.experiment.launch import locked, sub_folder
+from torch_qpmpc.experiment.launch import sub_folder
 
 ROOT = Path(__file__).parents[2]
 #: The settings of each launcher but `cores`, which test_docs.py runs.
@@ -75,16 +75,6 @@ def test_a_sweep_resumes(tmp_path, capsys):
     sentence = "holds a run with exploration_std=0.3, expected exploration_std=0.2. Choose another"
     assert f"{sentence} folder with hydra.sweep.dir=FOLDER." in capsys.readouterr().err
     assert (first / "checkpoint.pt").stat().st_mtime_ns == before
-
-
-def test_a_sweep_does_not_write_to_a_folder_in_use(tmp_path, capsys):
-    folder = tmp_path / "gaussian-free-seed1"
-    folder.mkdir()
-    with locked(folder, ""), pytest.raises(SystemExit) as refused:
-        sweep(tmp_path, "seed=1")
-    assert refused.value.code == 1
-    assert f"got {folder}, in use by another process" in capsys.readouterr().err
-    assert not (folder / "config.yaml").exists()
 
 
 def test_sub_folders_are_named_by_what_the_sweep_varies(tmp_path):
