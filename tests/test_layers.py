@@ -31,7 +31,7 @@ BUDGET = {
     "analysis": 851,
     "control": 4824,  # nonlinear plants
     "envs": 1350,
-    "experiment": 2760,
+    "experiment": 2751,
     "export": 1474,
     "learning": 2831,  # models that did not train theta decide in improve
     "identification": 2650,

@@ -79,12 +79,13 @@ def test_an_error_of_the_user_is_one_sentence(tmp_path, monkeypatch, error, sent
 def test_ctrl_c_stops_at_once_and_names_the_command_that_goes_on(tmp_path, monkeypatch, capsys):
     overrides = (*SMALL, "updates=5", "eval_interval=3", "task.eval_steps=5")
     interrupt(monkeypatch, update=5)
+    folder = f"hydra.run.dir={tmp_path}/my run"
     with pytest.raises(SystemExit) as ended:
-        run_command(*overrides, f"hydra.run.dir={tmp_path}")
+        run_command(*overrides, folder)
     assert ended.value.code == 128 + signal.SIGINT
-    said = f"\nStopped: go on with python train.py {' '.join(overrides)} hydra.run.dir={tmp_path}\n"
+    said = f"\nStopped: go on with python train.py {' '.join(overrides)} '{folder}'\n"
     assert capsys.readouterr().out.endswith(said)
-    assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 3
+    assert load_file(tmp_path / "my run" / "checkpoint.pt", KIND)["update"] == 3
 
 
 def test_sigterm_stops_a_run_whatever_a_library_makes_of_it(tmp_path, monkeypatch):

@@ -20,7 +20,7 @@ from torch_qpmpc import QPError
 from torch_qpmpc.envs import PointMass, PointMassGymEnv
 from torch_qpmpc.experiment import evaluation
 from torch_qpmpc.experiment import metrics as metrics_of_runs
-from torch_qpmpc.experiment.launch import LOCK, same_command
+from torch_qpmpc.experiment.launch import LOCK
 from torch_qpmpc.experiment.run_folder import read_config, read_metrics
 from torch_qpmpc.files import load_file
 from torch_qpmpc.mpc.layout import Layout, band_distance
@@ -268,14 +268,6 @@ def test_a_finished_run_is_shown_again_and_not_overwritten(tmp_path, capsys):
     (folder / "config.yaml").unlink()
     with pytest.raises(SystemExit, match=r"holds a run without its config\.yaml, expected a"):
         run_command(*TINY, f"hydra.run.dir={folder}")
-
-
-def test_the_sentence_of_a_stopped_run_has_its_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        train, "train", lambda *_, **__: print(same_command("my run")) or {"closed_gap": 1}
-    )
-    run_command("seed=2", f"hydra.run.dir={tmp_path}")
-    assert capsys.readouterr().out == "python train.py seed=2 'hydra.run.dir=my run'\n"
 
 
 def test_runs_that_start_in_the_same_second_have_folders_of_their_own():

@@ -128,11 +128,6 @@ class Evaluation:
         for name, part in {**state, "loops": loops}.items():
             getattr(self, name).update(part)
 
-    def lines(self) -> dict[str, float]:
-        """Return J of the start, the true model and the rivals by name."""
-        ends = {name: self.loops[name].J for name in ("start", "true model") if name in self.loops}
-        return ends | self.rivals
-
     def summary(self) -> dict[str, Any]:
         """Return J of the start, the learned and the true model, the closed gap and the rivals.
 

@@ -67,12 +67,6 @@ def settled(
     return state, read_summary(folder) if finished else None
 
 
-def same_command(folder: str | Path) -> str:
-    """Return the command line of this process for the run in ``folder``, to go on with it."""
-    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    return f"{COMMAND} {shlex.join([*given, f'hydra.run.dir={folder}'])}"
-
-
 def _key(sweep: bool) -> str:
     return f"hydra.{'sweep' if sweep else 'run'}.dir"
 
@@ -117,7 +111,8 @@ def launched() -> Iterator[tuple[str, bool]]:
     except BaseException as error:  # libraries make errors of their own of Ctrl-C
         if sweep or not (stopped or isinstance(error, KeyboardInterrupt)):
             raise
-        print(f"\nStopped: go on with {same_command(folder)}", flush=True)
+        command = shlex.join([*hydra.overrides.task, f"hydra.run.dir={folder}"])
+        print(f"\nStopped: go on with {COMMAND} {command}", flush=True)
         raise SystemExit(128 + (stopped or [signal.SIGINT])[-1]) from None
     finally:
         logging.captureWarnings(False)

@@ -81,7 +81,8 @@ def draw_learning(
 ) -> None:
     """Draw J over updates and experience, with the J of the others as lines."""
     axes.plot(updates, J, color=COLOURS["learned"], marker="o", markersize=3, label="learned")
-    draw_lines(axes, evaluation.lines())
+    others = {x: loop.J for x, loop in evaluation.loops.items() if x in ("start", "true model")}
+    draw_lines(axes, others | evaluation.rivals)
     axes.set(xlabel="update", ylabel="J, mean over starts")
     scale_costs(axes)
     first, each = experience(evaluation.cfg)
