@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from torch_qpmpc.analysis.structure import predictions
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.learning.operators import QPActorValueOperator, warm_policy
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
+from torch_qpmpc.mpc import nonlinear
 from torch_qpmpc.mpc.nonlinear import PlanSolution, of_networks
 from torch_qpmpc.proofs import Polytope, largest_difference
 from torch_qpmpc.qp.program import Status
@@ -258,6 +260,41 @@ def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):
         return solution.value / cost, solution.plan / u_unit, slope * x_unit / u_unit
 
     assert_close(found(*units), found(1.0, 1.0, 1.0), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1e3, 1.0), (1e6, 1.0), (1.0, 1e3)])
+def test_plans_for_a_stage_cost_do_not_depend_on_the_units(units):
+    """A decaying catalyst in mol/l and K cost 8.55: its cost had the curvature of other units."""
+    c_unit, T_unit = units
+
+    def catalyst(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        c, T = x[..., 0] / c_unit, x[..., 1] / T_unit
+        c = c * (-5e5 * (-6000 / T).exp()).exp()
+        after = torch.stack((c * c_unit, x[..., 1] + 0.2 * (u[..., 0] - x[..., 1])), -1)
+        return after, 1e3 * c + 1e-5 * (T - 300) ** 2
+
+    model = {"A": torch.eye(2), "B": torch.zeros(2, 1), "stage_weight": torch.zeros(3)}
+    bounds: Any = {"action_bounds": ([300.0 * T_unit], [450.0 * T_unit]), "gamma": 1.0}
+    mpc = QPMPC.of(2, 1, 20, dynamics=catalyst, solver="daqp", **model, **bounds)
+    s = torch.tensor([[1e-3, 380.0], [2e-3, 350.0]]).double() * torch.tensor(units)
+    assert_close(mpc.value(s), torch.tensor([5.931938, 12.891113]).double(), rtol=1e-5, atol=0)
+
+
+def test_a_search_goes_on_nearer_to_its_plan_if_a_qp_is_not_solved(monkeypatch):
+    mpc, own, calls = made(priced=True), nonlinear.solve, []
+
+    def failing(*arguments: Any) -> Any:
+        calls.append(solution := own(*arguments))
+        limit = torch.full_like(solution.status, Status.NOT_CONVERGED)
+        return replace(solution, status=limit) if len(calls) == 2 else solution
+
+    s = states(mpc)
+    want = mpc.value(s)
+    monkeypatch.setattr(nonlinear, "solve", failing)
+    solution = mpc.solve(s)
+    assert isinstance(solution, PlanSolution)
+    assert solution.converged.all()
+    assert_close(solution.value, want)
 
 
 def test_a_plan_is_an_argument_and_a_result():

@@ -123,14 +123,9 @@ class Bounds:
                 raise QPError.expected("action_levels", f"{len(levels)} entries", want)
             u = hull("action_bounds", u, levels, [f"action {i}" for i in range(n_u)])
         lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
-        n_linear = layout.n_mixed + layout.n_terminal
-        price = _matching_slack("constraint_slack", self.constraint_slack, n_linear)
-        w = layout.rows(
-            _matching_slack("state_slack", self.state_slack, n_x),
-            _matching_slack("action_slack", self.action_slack, n_u),
-            price[: layout.n_mixed],
-            price[layout.n_mixed :],
-        )
+        sizes = zip(SLACKS, (n_x, n_u, layout.n_mixed + layout.n_terminal), strict=True)
+        x, u, linear = (_matching_slack(name, getattr(self, name), n) for name, n in sizes)
+        w = layout.rows(x, u, *linear.split((layout.n_mixed, layout.n_terminal)))
         G = LinearRows(layout)(D[0], D_f[0])
         return {"G": G, "lb": lower, "ub": upper, "w": w}
 

@@ -75,7 +75,14 @@ class Cost:
         """
         stage, terminal = self.stage_weight, self.terminal_weight
         if stage is None:
-            raise _without_weight(layout)
+            n_x, n_u = layout.n_x, layout.n_u
+            example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
+            remedy = (
+                f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
+                "weighted 1 and actions 0.1, twice the plant's own weights."
+            )
+            expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
+            raise QPError.expected("stage_weight", "none", expected, remedy)
         if isinstance(terminal, str):
             terminal = terminal_riccati(A, B, stage, gamma, layout)
         elif terminal is None:
@@ -130,15 +137,3 @@ def _blocks(stage: Tensor, terminal: Tensor, hessian: str, layout: Layout) -> di
     check_weight("stage_weight", stage, diagonal, n_d)
     check_weight("terminal_weight", terminal, diagonal, n_d)
     return {"H": stage, "H_f": terminal}
-
-
-def _without_weight(layout: Layout) -> QPError:
-    """Make the error of a cost without a stage weight, with an example of these sizes."""
-    n_x, n_u = layout.n_x, layout.n_u
-    example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
-    remedy = (
-        f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
-        "weighted 1 and actions 0.1, twice the plant's own weights."
-    )
-    expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
-    return QPError.expected("stage_weight", "none", expected, remedy)

@@ -112,18 +112,15 @@ class Levels:
             The solution, with the number of nodes as ``iterations``. With the status ``NODE_LIMIT``
             its ``value_error`` contains the gap to the best plan that there may be.
         """
-        theta = (*qp.tensors(), fixed)
-        if not is_eager(theta):
+        if not is_eager(theta := (*qp.tensors(), fixed)):
             want = "one outside torch.compile, torch.func and losses without deactivate_vmap=True"
             raise QPError.expected("action_levels", "a traced call", want)
         with torch.no_grad():
             programs, batch = Programs.of(*(x.detach().cpu() for x in theta), n_kept=n_kept)
             found = self.search(programs)
-
-        def batched(x: np.ndarray) -> Tensor:
-            return torch.from_numpy(x).reshape((*batch, *x.shape[1:])).to(qp.q.device)
-
-        places, active, costs, ends, nodes, gaps = map(batched, found)
+        places, active, costs, ends, nodes, gaps = (
+            torch.from_numpy(x).reshape((*batch, *x.shape[1:])).to(qp.q.device) for x in found
+        )
         free = np.isin(self.rows, programs.prepared.reduced(programs.n_f).rows)  # not u_0 of Q
         at = places.where(torch.from_numpy(free).to(places.device), -1)
         values = torch.from_numpy(self.values).to(qp.lb).expand(*at.shape[:-1], -1)

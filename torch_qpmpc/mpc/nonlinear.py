@@ -5,9 +5,9 @@ V(s) is a local minimum, over plans u_0, .., u_{N-1}, of theta's cost and f's st
     1/2 z'Hz + q'z + c + w'sigma + sum_k gamma^k l(x_k, u_k, d_k),  x_{k+1} = f(x_k, u_k, d_k),
 
 with the rows of theta. The QP along a plan has f's Jacobians as A_k, B_k and E_k, and the positive
-parts of l's Hessians (Gauss and Newton), with a proximal term (Levenberg and Marquardt). Its step,
-shortened until the cost and the priced violations of hard rows fall, leads to the next plan. All
-plans are simulations of f.
+parts of l's Hessians (Gauss and Newton) in units of the changes that actions make, with a proximal
+term (Levenberg and Marquardt). Its step, shortened until the cost and the priced violations of hard
+rows fall, leads to the next plan. All plans are simulations of f.
 
 Where this converges, the QP's multipliers are those of the nonlinear program. They give the
 gradient of V, and the QP's KKT system that of the plan, with the Hessian of the Lagrangian, f's
@@ -51,6 +51,8 @@ SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
 PRICE, FIRM, SLIP = 2.0, 0.3, 1e-3
 #: The least eigenvalue of a definite Hessian and multiplier of an active row, relatively.
 DEFINITE, ACTIVE = 1e-9, 1e-8
+#: The least change of a state, relative to its range over the random plans.
+LEVER = 1e-3
 #: The parts of a `QPSolution` besides its QP.
 PARTS = [*QPSolution.__annotations__][1:]
 
@@ -214,8 +216,18 @@ class SequentialQP(nn.Module):
         W = _jacobian(slope, w, w.shape[-1])[1].detach()
         return (W + W.mT) / 2
 
-    def along(self, qp: QuadraticProgram, z: Tensor, chi: Tensor | None = None) -> QuadraticProgram:
-        """Return the QP along z ``(B, n_z)``.
+    def moved(self, of_x: Tensor, most: Tensor) -> Tensor:
+        """Return how far actions move w ``(B, N, n)``: roots of Gramians, at most ``most``."""
+        _, A, B = of_x.split(self.sizes, -1)
+        B, S, sizes = B * most[:, None, None, -self.layout.n_u :], torch.zeros_like(A[:, 0]), []
+        for A_k, B_k in zip(A.unbind(1), B.unbind(1), strict=True):
+            sizes.append(S.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf))
+            S = A_k @ S @ A_k.mT + B_k @ B_k.mT
+        sizes = F.pad(torch.stack(sizes, 1), self.sizes[::2], value=torch.inf)
+        return sizes.maximum(LEVER * most.unsqueeze(1)).minimum(most.unsqueeze(1))
+
+    def along(self, qp: QuadraticProgram, z: Tensor, chi: Any, most: Any) -> QuadraticProgram:
+        """Return the QP along z ``(B, n_z)``, with the ranges ``most`` ``(B, n)`` for `moved`.
 
         With multipliers ``chi`` of a solution z, it has the derivatives of the nonlinear program:
         H is the Lagrangian's Hessian, and other parts depend on the parameters of the dynamics.
@@ -243,8 +255,10 @@ class SequentialQP(nn.Module):
         elif of_l.any():
             if W is None:
                 W = self.curvature(w, F.pad(torch.ones_like(powers), (n_x, 0)).expand_as(out))
-            values, vectors = torch.linalg.eigh((powers.unsqueeze(-1) * W).nan_to_num(0, 0, 0))
-            H = (vectors * values.clamp(min=0).unsqueeze(-2)) @ vectors.mT
+            size = self.moved(of_x, most).unsqueeze(-1)
+            values, vectors = torch.linalg.eigh((size * W * size.mT).nan_to_num(0, 0, 0))
+            vectors = vectors / torch.where(size > 0, size, torch.inf)
+            H = (vectors * (powers * values.clamp(min=0)).unsqueeze(-2)) @ vectors.mT
             q, c = q - times(H, w), c + (w * times(H, w)).sum(-1) / 2
         if H is not None:
             whole[:, self.entries.unsqueeze(-1), self.entries.unsqueeze(-2)] += H
@@ -291,7 +305,7 @@ class SequentialQP(nn.Module):
             report(known[5].cpu().numpy(), batch, on_failure)
         strict = None
         if torch.is_grad_enabled() and any(x.requires_grad for x in (*theta, *self.parameters())):
-            own = self.along(flat, known[1], known[2])
+            own = self.along(flat, known[1], known[2], None)
             solved = known[5] == Status.SOLVED
             strict = torch.zeros_like(solved)
             z, lam = known[1][solved], known[3][solved]
@@ -332,6 +346,8 @@ class SequentialQP(nn.Module):
             tries[:, :, 0] = fixed[:, None, n_p:]
         tries = tries[:, :, self.held]
         z, costs = self.simulated(p.unsqueeze(1), tries)
+        w = z[:, 1:, self.entries[:, layout.n_d :]].nan_to_num(0, 0, 0)
+        most = F.pad(w.amax((1, 2)) - w.amin((1, 2)), (layout.n_d, 0))
         least = merit(every, z, costs).amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
         price = torch.where(hard, FIRM * least / bound, price)
         best = merit(every, z, costs).argmin(1)
@@ -343,7 +359,7 @@ class SequentialQP(nn.Module):
         for _ in range(self.iterations):
             if not len(todo := (~done).nonzero().squeeze(1)) and parts:
                 break
-            near = self.along(_taken(qp, todo), z[todo])
+            near = self.along(_taken(qp, todo), z[todo], None, most[todo])
             size = near.H.diagonal(dim1=1, dim2=2)
             of_after = layout.predicted(size)[0][:, 1:].flatten(1)
             of_before = times(near.C[:, : len(self.C)].mT.square(), of_after)
@@ -356,11 +372,11 @@ class SequentialQP(nn.Module):
             if stuck.any():  # along a plan, rows may contradict each other that others keep
                 near = replace(near, w=torch.where(stuck, price[todo], near.w), check_values=False)
                 solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
-            own = [getattr(solution, name) for name in PARTS]
-            parts = parts or [x.new_empty(B, *x.shape[1:]) for x in own]
-            for part, x in zip(parts, own, strict=True):
-                part[todo] = x
             solved, among = solution.solved, torch.arange(len(todo))
+            own = [getattr(solution, name) for name in PARTS]
+            parts = parts or [x.clone() for x in own]
+            for part, x in zip(parts, own, strict=True):
+                part[todo[solved]] = x[solved]
             lam = torch.where(hard[todo] & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
             price[todo] = price[todo].maximum(lam)
             step = (layout.predicted(solution.z)[1] - u[todo]) * solved[:, None, None]
@@ -379,7 +395,7 @@ class SequentialQP(nn.Module):
             converged[todo] = solved & small & (pull[todo] <= 1) & before.isfinite()
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
-            done[todo] = ~solved | converged[todo] | (pull[todo] > MOST)
+            done[todo] = converged[todo] | (pull[todo] > MOST)
         left = (~converged & (parts[5] == 0)).nonzero().squeeze(1)  # the plan in place of the QP's
         parts[0][left] = merit(left, z[left].unsqueeze(1), costs[left].unsqueeze(1))[:, 0]
         parts[1][left] = z[left]
