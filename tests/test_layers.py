@@ -33,11 +33,11 @@ BUDGET = {
     "envs": 1350,
     "experiment": 2751,
     "export": 1474,
-    "learning": 2831,  # models that did not train theta decide in improve
-    "identification": 2650,
-    "mpc": 3844,
+    "learning": 2830,  # models that did not train theta decide in improve
+    "identification": 2651,
+    "mpc": 3846,
     "proofs": 1001,
-    "qp": 5297,
+    "qp": 5295,
     "study": 584,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

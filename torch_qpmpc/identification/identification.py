@@ -104,8 +104,9 @@ class Identified:
         """
         model, arrays = self.fit.model, []
         for name, x in {"u": u, "y": y, "d": d}.items():
+            given = ungraded(name, x)
             try:
-                arrays.append(np.asarray(ungraded(name, x), dtype=float))
+                arrays.append(np.asarray(given, dtype=float))
             except (TypeError, ValueError) as error:
                 raise QPError.expected(name, class_name(x), "an array of numbers") from error
         u, y, steps = *arrays[:2], len(arrays[0]) if arrays[0].ndim else 0

@@ -49,10 +49,9 @@ SETTLED, ROUNDING, OVERFLOW = 1e-7, 1e-11, 1e50
 #: The price of a hard row's violation: relative to its largest multiplier, and before there is one
 #: to the cost of a violation by the row's bound; and the share of it that infeasible QPs may leave.
 PRICE, FIRM, SLIP = 2.0, 0.3, 1e-3
-#: The least eigenvalue of a definite Hessian and multiplier of an active row, relatively.
-DEFINITE, ACTIVE = 1e-9, 1e-8
-#: The least change of a state, relative to its range over the random plans.
-LEVER = 1e-3
+#: The least eigenvalue of a definite Hessian, multiplier of an active row, and change of a state by
+#: actions, relatively.
+DEFINITE, ACTIVE, LEVER = 1e-9, 1e-8, 1e-3
 #: The parts of a `QPSolution` besides its QP.
 PARTS = [*QPSolution.__annotations__][1:]
 
