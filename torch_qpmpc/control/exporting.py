@@ -327,8 +327,11 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
     if missing:
         own |= {"S": S, "FIRST": first, "LS": LS, "LSL": LS @ observer.L.T}
         own |= {"OF_S": np.sqrt(np.diag(S)), "STEADY": np.array([STEADY])}
-    if design.pulls[1].size:
-        own |= _pulls(law.mpc)
+    if design.pulls[1].size:  # the maps of `Design.weighed`
+        (moved, shifts), tables = design.pulls, make_tables(law.mpc.targets)
+        n_g = len(law.mpc.targets.quadratic_program().lb)
+        shifts = np.pad(shifts, ((0, 0), (n_g - shifts.shape[1], 0)))[:, tables.places]
+        own |= {"moved": moved, "shifts": shifts / tables.rows.unit, "Q": design.Q}
     return {
         **{key.upper(): x for key, x in own.items()},
         **{f"{key}_V": getattr(steady, key) for key in "XUY"},
@@ -344,14 +347,6 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
         "STAYS": np.array([max(STAYS, 100 * np.finfo(dtype).eps)]),
         **({"INPUT_LEVELS": on_levels, "SWITCH": law.switches} if levels else {}),
     }
-
-
-def _pulls(mpc: LinearMPC) -> dict[str, Array]:
-    """Return the maps of `Design.weighed`, the second one with a column a row of the tables."""
-    (own, shifts), tables = mpc.design.pulls, make_tables(mpc.targets)
-    n_g = len(mpc.targets.quadratic_program().lb)
-    shifts = np.pad(shifts, ((0, 0), (n_g - shifts.shape[1], 0)))[:, tables.places]
-    return {"moved": own, "shifts": shifts / tables.rows.unit, "Q": mpc.design.Q}
 
 
 def _moves(mpc: LinearMPC, dtype: str) -> Array:

@@ -121,7 +121,9 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     """Return L and W with x'P x + 2 x'L off + off'W off >= 0, where L off is the target's slope.
 
     ``off`` is y_s - r of the outputs with a weight. Modes at one, whose state inputs choose, take
-    the part of the slope that moves no input.
+    the part of the slope that moves no input. The slope is that of held inputs; with one input,
+    which any slope of this sign keeps at its bound, that of the loop to r without bounds: far from
+    the target, where the input is free, the other would lead plans away from r.
     """
     normal, (of_y, of_u, of_x, _), of_r = design.normal, design.scaling, design.weighted
     A, B, C = normal.plant.A, normal.plant.B, normal.plant.C
@@ -133,7 +135,14 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     slope[np.abs(slope) < RANK * size] = 0.0  # rounding would set the lengths of the QP
     L = np.pad(slope, ((0, len(P) - len(A)), (0, 0)))
     sizes = np.concatenate((of_x, of_u))[: len(P)]
-    values, V = np.linalg.eigh(P * np.outer(sizes, sizes))
+    P = P * np.outer(sizes, sizes)
+    if len(of_u) == 1:
+        steady, Q = design.steady, design.Q[np.ix_(of_r, of_r)]
+        Y, *maps = (part[:, : steady.n_a] for part in (steady.Y[of_r], steady.X, steady.U))
+        to_r = np.linalg.pinv(Y.T @ Q @ Y) @ Y.T @ Q * of_y[of_r]
+        L = L - L @ (Y @ to_r / of_y[of_r, None])
+        L = L + P @ (np.vstack(maps)[: len(P)] @ to_r / sizes[:, None])
+    values, V = np.linalg.eigh(P)
     own = V.T @ L / np.sqrt(np.maximum(values, TINY * values[-1]))[:, None]
     of_r = of_y[of_r]
     return L / np.outer(sizes, of_r), own.T @ own / np.outer(of_r, of_r)
@@ -253,7 +262,11 @@ def target_mpc(design: Design) -> QPMPC:
     if len(steady.W):
         f = np.eye(len(steady.W), len(weight), n_x + steady.n_a)
         f[:, :n_f] -= np.eye(len(f), n_f)
-        weight += _squares(f, _preference(design) * steady.W)
+        W, Y = steady.W, steady.Y[:, : steady.n_a]
+        if Y.size:  # else no output has a weight
+            seen = np.linalg.eigvalsh(Y.T @ design.Q @ Y)[0]
+            W = W * float(PREFERENCE * seen / np.linalg.norm(W, 2))
+        weight += _squares(f, W)
     sizes, n_d = design.scaling, design.plant.sizes[3]
     error[:, :n_r] = 0.0
     K, bands = np.eye(n_d, error.shape[1], n_x - 1 - n_d), design.bands
@@ -277,12 +290,3 @@ def target_mpc(design: Design) -> QPMPC:
     layout, one = Layout(n_x, len(weight) - n_x, horizon=1), {n_x - 1: 1.0}
     scheme = Scheme(layout, model, cost, bounds, gamma=1.0, constants=one)
     return QPMPC(scheme, learn=(), solver="daqp")
-
-
-def _preference(design: Design) -> float:
-    """Return the factor of f's weight, one if no output has a weight."""
-    Y = design.steady.Y[:, : design.steady.n_a]
-    if not Y.size:
-        return 1.0
-    seen = np.linalg.eigvalsh(Y.T @ design.Q @ Y)
-    return float(PREFERENCE * seen[0] / np.linalg.norm(design.steady.W, 2))
