@@ -99,6 +99,13 @@ def test_what_an_order_reaches_is_not_late(log):
     qm.identify(log)
 
 
+def test_an_output_that_is_seldom_seen_is_identified():
+    """No row had an output to start a fit from: numpy's own error ended it."""
+    log = late_log(0, 0.02)
+    log["y"][np.arange(1201) % 25 > 0] = np.nan
+    assert qm.identify(log, order=1).fit.model.poles.real == pytest.approx(0.8, abs=0.05)
+
+
 def test_an_order_above_what_the_log_shows_is_what_it_shows():
     """Without noise two states are nearly all: the outputs alone were the model of order 4."""
     rng, x, y = np.random.default_rng(0), np.zeros(2), np.zeros(401)

@@ -273,8 +273,22 @@ def test_the_repeats_of_a_slow_sensor_are_missing():
     assert qm.identify(log).R2[-1].min() > 0.98
 
 
+def set_point(rows: int) -> dict[str, np.ndarray]:
+    """Return the log of a loop whose set-point, an output, changes every so many rows."""
+    rng = np.random.default_rng(0)
+    r, y, u = rng.uniform(0, 9, 20).repeat(rows), np.zeros(20 * rows), np.zeros(20 * rows)
+    for k in range(len(u) - 1):
+        u[k] = 2 * (r[k] - y[k])
+        y[k + 1] = 0.9 * y[k] + 0.1 * u[k] + 0.1 * rng.normal()
+    return {"y1": y, "y2": r, "u": u}
+
+
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("log", [slow(5), slow(8, 2.0)], ids=["inputs repeat, too", "quantised"])
+@pytest.mark.parametrize(
+    "log",
+    [slow(5), slow(8, 2.0), set_point(40)],
+    ids=["inputs repeat, too", "quantised", "a set-point"],
+)
 def test_other_repeats_stay(log):
     assert qm.read_log(log).trajectories[0].y.isfinite().all()
 

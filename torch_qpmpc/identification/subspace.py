@@ -384,7 +384,7 @@ class _Normal:
     """
 
     def __init__(self, trajectories: Sequence[Trajectory]) -> None:
-        self.apart, self.n_u = _unmoved(trajectories), trajectories[0].u.shape[1]
+        self.apart, self.n_u = unmoved_outputs(trajectories), trajectories[0].u.shape[1]
         y = np.concatenate([x.y.numpy() for x in trajectories])
         held = [continued(x.y.numpy()[:, self.apart]) for x in trajectories]
         self.first = np.array([x[0] for x in held])
@@ -447,7 +447,7 @@ class _Normal:
         )
 
 
-def _unmoved(trajectories: Sequence[Trajectory]) -> Any:
+def unmoved_outputs(trajectories: Sequence[Trajectory]) -> Any:
     """Return True for outputs that never change, or seldom and whatever the inputs, ``(n_y,)``.
 
     Changes of an output that most measurements repeat, such as a set-point, are regressed on the
@@ -497,11 +497,12 @@ def _runs(data: Sequence[Signals]) -> list[Signals]:
 
 
 def _filled(data: Sequence[Signals]) -> list[Signals]:
-    """Return the trajectories with gaps of outputs up to FILLED rows filled along lines."""
+    """Fill gaps of outputs along lines: up to FILLED rows, or all of a sensor that is slow."""
     filled = [one._replace(y=one.y.copy()) for one in data]
     for column in (column for one in filled for column in one.y.T):
+        most = FILLED if np.isfinite(np.diff(column)).any() else len(column)
         for i, k in runs(np.isnan(column)):
-            if i > 0 and k < len(column) and k - i <= FILLED:
+            if i > 0 and k < len(column) and k - i <= most:
                 column[i:k] = np.interp(range(i, k), (i - 1, k), column[[i - 1, k]])
     return filled
 

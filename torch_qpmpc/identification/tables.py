@@ -18,6 +18,7 @@ from torch_qpmpc.checks import ungraded
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.clock import FEWEST, gaps_of, seconds, shows_times
 from torch_qpmpc.identification.log import LARGEST, STILL, Log, Trajectory, runs
+from torch_qpmpc.identification.subspace import unmoved_outputs
 
 #: A number that repeats is a mark, such as -9999, if it is this many ranges of all others away, and
 #: so are errors: numbers in two rows or more, but at most the share FEW of them. A slow sensor
@@ -144,16 +145,11 @@ def _read_csv(path: Path) -> pd.DataFrame:
         rows = csv.reader(io.StringIO(text), delimiter=sep, skipinitialspace=True)
         headers[sep] = next(filter(None, rows), [])
     sep = max(headers, key=lambda sep: len(headers[sep]))
+    decimal = "." if sep == "," else ","
+    options: Any = {"index_col": False, "skipinitialspace": True, "low_memory": False}
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # that fields would be lost
-        frame = pd.read_csv(
-            io.StringIO(text),
-            sep=sep,
-            decimal="." if sep == "," else ",",
-            index_col=False,
-            skipinitialspace=True,
-            low_memory=False,
-        )
+        frame = pd.read_csv(io.StringIO(text), sep=sep, decimal=decimal, **options)
     # Without pandas's other names for what is there twice.
     return frame.set_axis(headers[sep], axis=1)
 
@@ -271,13 +267,16 @@ def _marked(values: np.ndarray, names: Sequence[str]) -> list[str]:
 def _repeated(values: np.ndarray, outputs: Sequence[str]) -> list[str]:
     """Replace values that a sensor repeats until every m-th row by NaN, and name it.
 
-    In a plant at rest, outputs repeat as inputs do: these change in other rows.
+    In a plant at rest, outputs repeat as inputs do: these change in other rows. A set-point stays.
     """
     notes, moves = [], np.flatnonzero(np.diff(values[:, len(outputs) :], axis=0).any(1))
+    numbers = torch.as_tensor(np.where(np.abs(values) <= LARGEST, values, np.nan))
+    y, u = numbers.tensor_split((len(outputs),), 1)
+    still = unmoved_outputs([Trajectory(y, u[:-1].nan_to_num(), u[:-1, :0])])
     for i, name in enumerate(outputs):
         rows = 1 + np.flatnonzero(np.diff(values[:, i]))  # NaN is no repeat
         m = int(np.gcd.reduce(np.diff(rows))) if len(rows) > FEWEST else 1
-        if len(rows) * m > OFTEN * len(values) and len({*(moves % m).tolist()}) > 1:
+        if not still[i] and len(rows) * m > OFTEN * len(values) and len({*(moves % m)}) > 1:
             values[np.arange(len(values)) % m != rows[0] % m, i] = np.nan
             notes.append(f"{name} has a new value every {m} rows: its repeats are taken as missing")
     return notes
