@@ -14,7 +14,14 @@ import train
 from tests.runs import SMALL, linear_system, make_config
 from torch_qpmpc import QPError
 from torch_qpmpc.experiment.config import Config
-from torch_qpmpc.experiment.start import LOG, Exploration, collect_log, make_start, stored_log
+from torch_qpmpc.experiment.start import (
+    LOG,
+    OBSERVER,
+    Exploration,
+    collect_log,
+    make_start,
+    stored_log,
+)
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.gymnasium import given_scheme
 from torch_qpmpc.experiment.tasks.identified import identified_start
@@ -212,6 +219,15 @@ def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
     train.train(cfg, str(tmp_path / "second"), quiet=True)
     assert torch.equal(FinishedRun(tmp_path / "second").start.C, run.start.C)
     assert "Model of order" not in capsys.readouterr().out
+
+
+def test_the_observer_of_a_run_that_ended_before_its_settings_is_removed(tmp_path):
+    """A later run in its folder went on with that observer."""
+    old = tmp_path / OBSERVER
+    old.touch()
+    cfg = make_config(*SMALL)
+    assert make_start(cfg, make_physics(cfg), tmp_path) is None
+    assert not old.exists()
 
 
 def test_damaged_logs_are_named(tmp_path):

@@ -65,12 +65,12 @@ def make_start(
 ) -> Start | None:
     """Identify the start of a run from a log of the plant; None with ``start=model``.
 
-    With ``task.start_episodes`` closed loops choose it. The run's folder keeps the log, the
-    observer and the table of the choice.
+    Closed loops may choose it; the run's folder keeps the log, the observer and their table.
     """
+    path = Path(folder) / LOG
+    path.with_name(OBSERVER).unlink(missing_ok=True)  # of a run that ended before its config.yaml
     if cfg.start.name != "data":
         return None
-    path = Path(folder) / LOG
     if cfg.start.file is not None:
         log = stored_log(cfg.start.file, "start.file", FORMAT)
     else:
