@@ -41,11 +41,7 @@ from torch_qpmpc.experiment.algorithms import (
 from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.evaluation import Evaluation, check_rewards, cost_text
 from torch_qpmpc.experiment.gating import RunGate
-from torch_qpmpc.experiment.launch import (
-    check_overrides,
-    launched,
-    settled,
-)
+from torch_qpmpc.experiment.launch import check_overrides, launched, settled
 from torch_qpmpc.experiment.metrics import (
     Tally,
     draw_outcome,
@@ -56,11 +52,7 @@ from torch_qpmpc.experiment.metrics import (
 )
 from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import RunState
-from torch_qpmpc.experiment.start import (
-    make_start,
-    read_observer,
-    transitions,
-)
+from torch_qpmpc.experiment.start import make_start, read_observer, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import named_task, run_code
 from torch_qpmpc.files import save_file

@@ -78,7 +78,7 @@ class RunState:
             except (RuntimeError, KeyError, ValueError, TypeError, AttributeError) as error:
                 reason = str(error).strip().partition("\n")[0]
                 got = f"{name!r} that does not fit ({type(error).__name__}: {reason})"
-                raise QPError.expected("checkpoint", got, "the state of this run") from error
+                raise QPError.expected("checkpoint", got, "this run's, of this version") from error
         if state["collector"] is None:
             self.replay.end_episodes()
 
