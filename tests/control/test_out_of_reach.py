@@ -87,8 +87,9 @@ def test_a_horizon_decides_little_about_a_set_point_out_of_reach():
 def test_an_input_that_will_rest_at_its_bound_is_used_until_then(horizon):
     """It turns warm: in the end a room with heavy walls needs no heat, but not for 100 steps."""
     A, B, E = np.array([[0.88, 0.1], [0.01, 0.985]]), np.array([0.1, 0.0]), np.array([0.02, 0.005])
-    model, limits = (A, B[:, None], [[1.0, 0.0]]), {"u_bounds": (0.0, 5.0)}
-    mpc = qm.LinearMPC(model, horizon, E=E[:, None], known=["d"], Q=1.0, dR=0.025, **limits)
+    design: dict[str, Any] = {"Q": 1.0, "dR": 0.025, "u_bounds": (0.0, 5.0)}
+    model = A, B[:, None], [[1.0, 0.0]]
+    mpc = qm.LinearMPC(model, horizon, E=E[:, None], known=["d"], **design)
     controller = qm.Controller(mpc, noise=0.02, drift=0.002)
     x, u, cost = np.linalg.solve(np.eye(2) - A, 2.0 * B + 8.0 * E), 2.0, 0.0
     controller.reset(y=x[:1], u=[u], known=[8.0])

@@ -185,8 +185,8 @@ def test_targets_may_have_more_digits_than_states(clip):
     operator, td = make_operator(), make_batch(6)
     loss = make_loss(operator=operator, td_error_clip=clip)
     loss(td.clone())["loss_value"].backward()
-    exact = [p.grad.clone() for p in loss.parameters()]
-    loss.zero_grad()
+    exact = [p.grad for p in loss.parameters()]
+    loss.zero_grad(set_to_none=True)
     for key in ("observation", "action", ("next", "observation")):
         td[key] = td[key].float()
     assert loss.target(td).dtype == torch.float64
