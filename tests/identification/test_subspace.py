@@ -93,8 +93,18 @@ def test_a_dead_time_beyond_the_orders_is_told_with_the_order_that_finds_it():
     assert qm.identify(log, order=order).R2[-1] > 0.97
 
 
+def cycle() -> dict[str, np.ndarray]:
+    """Return the log of a display of tenths behind two lags, whose input has a period."""
+    u, x = np.sign(np.sin((np.arange(300) + 0.5) * np.pi / 10)), np.zeros((300, 2))
+    for k in range(299):
+        x[k + 1] = 0.9 * x[k, 0] + 0.1 * u[k], 0.3 * x[k, 0] + 0.7 * x[k, 1]
+    return {"y": np.round(x[:, 1], 1), "u": u}
+
+
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("log", [late_log(4, 0.1), late_log(0, 0.0)], ids=["early", "exact"])
+@pytest.mark.parametrize(
+    "log", [late_log(4, 0.1), late_log(0, 0.0), cycle()], ids=["early", "exact", "periodic"]
+)
 def test_what_an_order_reaches_is_not_late(log):
     qm.identify(log)
 

@@ -151,30 +151,35 @@ def held_out_errors(
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
     """Return the share of autocorrelations in the 95 % bound of white residuals, ``(n_y,)``."""
     z = _correlations(model, trajectories, CORRELATIONS)
-    return np.mean(np.abs(np.diagonal(z, 0, 1, 2)) <= 1.96, 0)
+    return np.mean(np.abs(np.diagonal(z, 0, 1, 2)[:, : len(model.C)]) <= 1.96, 0)
 
 
 def late_inputs(fit: Fit, trajectories: Sequence[Trajectory]) -> Array:
-    """Return how many rows late inputs act beyond the order's reach, ``(n_y, n_u)``; 0 if none."""
+    """Return the most rows late that inputs act, ``(n_y, n_u)``; 0 within the order's reach."""
     steps, n_y = sum(one.steps for one in trajectories), len(fit.model.C)
     last = max(min(LATEST, steps // len(trajectories) // 2), fit.order + 1)
-    z = np.abs(_correlations(fit.model, trajectories, last)[fit.order :, :, n_y:])
+    both = np.abs(_correlations(fit.model, trajectories, last, LATEST))[fit.order :]
+    z, future = both[:, :n_y, n_y:], both[:, n_y:, :n_y].max(0).T  # periodic inputs have both
     _, size = _scale(np.concatenate([one.y.numpy() for one in trajectories]))
     z[:, np.diag(fit.model.S) < 100 * EXACT * size**2] = 0.0
-    return (z.max(0) > max(SURE, np.sqrt(SEEN * steps))) * (fit.order + 1 + z.argmax(0))
+    least = np.maximum(2 * future, max(SURE, np.sqrt(SEEN * steps)))
+    return (z.max(0) > least) * (fit.order + 1 + z.argmax(0))
 
 
-def _correlations(model: Innovations, trajectories: Sequence[Trajectory], last: int) -> Array:
-    """Return correlations of residuals with residuals and inputs 1, .., ``last`` rows before.
+def _correlations(
+    model: Innovations, trajectories: Sequence[Trajectory], last: int, settling: int = 0
+) -> Array:
+    """Return correlations of residuals and inputs with those 1, .., ``last`` rows before.
 
-    They are in standard errors, ``(last, n_y, n_y + n_u)``.
+    They are in standard errors, ``(last, n_y + n_u, n_y + n_u)``, without the ``settling`` rows.
     """
-    z, n_y, errors = [], len(model.C), _errors(model, trajectories, 1)
+    z, errors = [], _errors(model, trajectories, 1)
     data = [np.hstack((e[:, 0], x.u.numpy())) for e, x in zip(errors, trajectories, strict=True)]
+    data = [rows[min(settling, len(rows) // 4) :] for rows in data]
     mean = np.nanmean(np.concatenate(data), 0)
     data = [np.nan_to_num(rows - mean) for rows in data]  # what is missing adds nothing
     for lag in range(1, last + 1):
-        after = np.concatenate([rows[lag:, :n_y] for rows in data])
+        after = np.concatenate([rows[lag:] for rows in data])
         before = np.concatenate([rows[: max(len(rows) - lag, 0)] for rows in data])
         size = np.sqrt((after**2).T @ before**2)
         z.append(after.T @ before / np.where(size > 0, size, 1.0))
