@@ -93,19 +93,6 @@ def test_entries_that_all_but_vanish_set_no_unit(solver, seed):
     assert units.length.max() < 100 * units.length.min()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_flat_costs_spoil_no_rates(seed):
-    """The stock x + u - d with the flat costs of an exponential had rates from 1e-7 to 1."""
-    A, B = [[1.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
-    qp = QPMPC.from_model(A, B, 30, stage_weight=[0.0, 0.0, 1e-7]).quadratic_program()
-    sizes = 10 ** (-19 * torch.rand(30, generator=torch.Generator().manual_seed(seed)) ** 4)
-    stock = torch.tensor([1.0, 1.0, 0.0]).double()
-    curved = torch.block_diag(*(size * stock.outer(stock) for size in sizes), torch.zeros(2, 2))
-    programs, _ = Programs.of(*replace(qp, H=qp.H + curved).tensors(), torch.ones(2).double())
-    C = np.abs(programs.scaled().theta.C[0])
-    assert (C[C > 0] > 1e-4).all()
-
-
 @pytest.mark.parametrize("count", [1, FEW])
 @pytest.mark.parametrize("bound", [1e3, 1e6, 1e10])
 def test_bounds_that_are_far_away_change_no_answer(solver, bound, count):

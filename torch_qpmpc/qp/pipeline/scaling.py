@@ -32,7 +32,7 @@ PASSES = 8
 ALIKE = 7
 #: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
 ROUNDING = 2.0**-40
-#: Where the largest entries decide, units are powers of two no further from one.
+#: Where entries all but vanish, units of those of z are powers of two no further from one.
 MOST = 25
 
 
@@ -153,7 +153,7 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     Their logarithms, and those of units of the rows and of the cost, bring those of the entries
     nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
-    part in its unit. Where these units make rates vanish, the largest entries decide (Ruiz, 2001).
+    part in its unit. Where entries all but vanish, the largest ones are one (Ruiz, 2001).
     """
     (M, n, _), r = H.shape, rows.shape[1]
     # The matrices of an MPC scheme are sparse.
@@ -163,9 +163,9 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
     shared = np.bincount(rates[1], minlength=M * r)[rates[1]] > 1
     own, start, shape = [x[shared] for x in rates], np.zeros(M * n), (M, n, r)
     units = _equilibrated(_means, start, costs, rates, shape)[0]
-    spoiled = _equilibrated(_largest, units, costs, own, shape)[2]
-    least = own[0] - _largest(own[1], own[0], M * r)[own[1]] - np.log2(LARGE)
-    if len(at := k[shared][spoiled <= least.clip(np.log2(ROUNDING))]):
+    of_largest, *scaled = _equilibrated(_largest, units, costs, own, shape)
+    vanishing = (np.concatenate(scaled) <= np.log2(ROUNDING)).nonzero()
+    if len(at := np.concatenate((m, k[shared]))[vanishing]):
         of_largest = _equilibrated(_largest, start, costs, own, shape)[0].clip(-MOST, MOST)
         units = np.where(np.isin(np.arange(M * n) // n, at), of_largest, units)
     return np.exp2(np.round(units.reshape(M, n)))
