@@ -30,10 +30,8 @@ APART = 2.0**14
 PASSES = 8
 #: QPs share a length if theirs, as powers of two, have the same quotient by this.
 ALIKE = 7
-#: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
+#: Entries below this, relative to the largest, may be what rounding leaves of zeros.
 ROUNDING = 2.0**-40
-#: Where entries all but vanish, units of those of z are powers of two no further from one.
-MOST = 25
 
 
 class Units(NamedTuple):
@@ -153,36 +151,32 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     Their logarithms, and those of units of the rows and of the cost, bring those of the entries
     nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
-    part in its unit. Where entries all but vanish, the largest ones are one (Ruiz, 2001).
+    part in its unit. Nor have entries that vanish beside the largest of their row and column, which
+    are made one first (Ruiz, 2001): what rounding leaves of zeros, and exponentials in a cost.
     """
     (M, n, _), r = H.shape, rows.shape[1]
-    # The matrices of an MPC scheme are sparse.
+    # The matrices of an MPC scheme are sparse. An entry of H belongs to two of z.
     (m, i, j), (k, row, column) = H.nonzero(), rows.nonzero()
-    costs = np.log2(np.abs(H[m, i, j])), m, m * n + i, m * n + j
-    rates = np.log2(np.abs(rows[k, row, column])), k * r + row, k * n + column
-    shared = np.bincount(rates[1], minlength=M * r)[rates[1]] > 1
-    own, start, shape = [x[shared] for x in rates], np.zeros(M * n), (M, n, r)
-    units = _equilibrated(_means, start, costs, rates, shape)[0]
-    of_largest, *scaled = _equilibrated(_largest, units, costs, own, shape)
-    vanishing = (np.concatenate(scaled) <= np.log2(ROUNDING)).nonzero()
-    if len(at := np.concatenate((m, k[shared]))[vanishing]):
-        of_largest = _equilibrated(_largest, start, costs, own, shape)[0].clip(-MOST, MOST)
-        units = np.where(np.isin(np.arange(M * n) // n, at), of_largest, units)
-    return np.exp2(np.round(units.reshape(M, n)))
+    sizes = np.log2(np.abs(np.concatenate((H[m, i, j], rows[k, row, column]))))
+    line = np.concatenate((M * r + m, k * r + row))
+    first = np.concatenate((m * n + i, np.full(len(k), M * n)))
+    second = np.concatenate((m * n + j, k * n + column))
 
+    def equilibrated(typical: Any, kept: np.ndarray, step: float) -> tuple[np.ndarray, ...]:
+        """Return units and scaled entries, the typical ones of which, of those kept, are near 0."""
+        units = np.zeros(M * n + 1)
+        for _ in range(PASSES):
+            scaled = sizes + units[first] + units[second]
+            scaled -= typical(line[kept], scaled[kept], M * r + M)[line]
+            units[:-1] -= step * typical(second[kept], scaled[kept], M * n)
+        return units[:-1].reshape(M, n), scaled
 
-def _equilibrated(
-    typical: Any, units: np.ndarray, costs: Any, rates: Any, shape: Any
-) -> tuple[np.ndarray, ...]:
-    """Return logarithms of units and of the scaled entries: ``typical`` ones are near zero."""
-    (of_cost, m, i, j), (of_rate, row, column), (M, n, r) = costs, rates, shape
-    both, power = np.concatenate((j, column)), 1 + (typical is _largest)
-    for _ in range(PASSES):
-        by_row = -typical(row, of_rate + units[column], M * r)
-        cost = -typical(m, of_cost + units[i] + units[j], M)
-        scaled = of_cost + units[i] + units[j] + cost[m], of_rate + units[column] + by_row[row]
-        units = units - typical(both, np.concatenate((scaled[0] / power, scaled[1])), M * n)
-    return units, *scaled
+    units, scaled = equilibrated(_largest, np.bincount(line)[line] > 1, 0.5)
+    for _ in range(2):
+        of_line, of_column = (_largest(x, scaled, x.max() + 1)[x] for x in (line, second))
+        kept = scaled > np.log2(ROUNDING) + np.minimum(of_line, of_column)
+        units, scaled = equilibrated(_means, kept, 1.0)
+    return np.exp2(np.round(units))
 
 
 def column_sizes(matrices: np.ndarray) -> np.ndarray:
