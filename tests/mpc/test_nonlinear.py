@@ -280,6 +280,30 @@ def test_plans_for_a_stage_cost_do_not_depend_on_the_units(units):
     assert_close(mpc.value(s), torch.tensor([5.931938, 12.891113]).double(), rtol=1e-5, atol=0)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e3, 1e6])
+def test_plans_on_their_bounds_are_within_them_and_converge(unit):
+    """Dosing was 5e-7 above its bound, relatively, and whole steps were refused for it."""
+
+    def tank(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        x, u = x / unit, u / unit
+        ion = x[..., 0] + 0.2 * (u[..., 0] - 1e-3 - x[..., 0])
+        acid = ((ion**2 + 4e-10).sqrt() - ion) / 2
+        after = torch.stack((ion, 0.9 * x[..., 1] + 0.1 * x[..., 0]), -1)
+        return after * unit, (acid.log10() + 5) ** 2
+
+    bounds: Any = {"action_bounds": ([0.0], [2e-3 * unit]), "gamma": 1.0, "stage_weight": [0.0] * 3}
+    mpc = QPMPC.of(2, 1, 20, dynamics=tank, solver="daqp", **bounds)
+    solution = mpc.solve(
+        torch.tensor([[x * unit, 0.0] for x in (-9e-4, -5e-4, 1e-4, 5e-4)]).double()
+    )
+    assert isinstance(solution, PlanSolution)
+    assert solution.converged.all()
+    assert solution.plan.min() >= 0
+    assert solution.plan.max() <= 2e-3 * unit * (1 + 1e-15)
+    want = torch.tensor([4.728462, 1.695495, 0.0, 1.695495]).double()
+    assert_close(solution.value, want, rtol=1e-5, atol=1e-6)
+
+
 def test_a_search_goes_on_nearer_to_its_plan_if_a_qp_is_not_solved(monkeypatch):
     mpc, own, calls = made(priced=True), nonlinear.solve, []
 

@@ -325,8 +325,7 @@ class SequentialQP(nn.Module):
         hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G[..., of_x] != 0).any(-1)))
         of_u, hard = hard & ~moved, hard & moved  # those of u alone no plan may violate
         price = torch.where(qp.w.isinf(), 0.0, qp.w).repeat(B if qp.w.ndim == 1 else 1, 1)
-        sides = torch.stack((qp.lb, qp.ub)).abs()
-        bound = torch.where(sides.isfinite(), sides, 0.0).amax(0)
+        bound = torch.stack((qp.lb, qp.ub)).abs().nan_to_num(posinf=0.0).amax(0)
         bound = torch.where(bound > 0, bound, 1.0).expand(B, -1)
 
         def merit(index: Tensor, z: Tensor, costs: Tensor) -> Tensor:
@@ -378,7 +377,10 @@ class SequentialQP(nn.Module):
                 part[todo[solved]] = x[solved]
             lam = torch.where(hard[todo] & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
             price[todo] = price[todo].maximum(lam)
-            step = (layout.predicted(solution.z)[1] - u[todo]) * solved[:, None, None]
+            box = solution.z[:, layout.n_preview :]  # the entries of G's first rows
+            low, high, firm = (x[..., : box.shape[1]] for x in (near.lb, near.ub, of_u[todo]))
+            box = F.pad(box.clamp(low, high).where(firm, box), (layout.n_preview, 0))
+            step = (layout.predicted(box)[1] - u[todo]) * solved[:, None, None]
             tries = torch.stack([u[todo] + share * step for share in FRACTIONS], 1)
             found = self.simulated(p[todo].unsqueeze(1), tries)
             before = merit(todo, z[todo].unsqueeze(1), costs[todo].unsqueeze(1))[:, 0]
@@ -407,8 +409,7 @@ class SequentialQP(nn.Module):
     def _plans(self, qp: QuadraticProgram) -> Tensor:
         """Return plans ``(.., K, N, n_u)``, held at zero and random within the bounds."""
         N, n_x, n = self.layout.horizon, self.layout.n_x, self.layout.n
-        sides = (x[..., : N * n].unflatten(-1, (N, -1))[..., n_x:] for x in (qp.lb, qp.ub))
-        low, high = (x.unsqueeze(-3) for x in sides)
+        low, high = (x[..., : N * n].unflatten(-1, (1, N, n))[..., n_x:] for x in (qp.lb, qp.ub))
         low = torch.where(low.isfinite(), low, high.where(high.isfinite(), 1.0) - 2)
         high = torch.where(high.isfinite(), high, low + 2)
         generator = torch.Generator().manual_seed(0)
@@ -435,8 +436,7 @@ def _jacobian(f: Any, w: Tensor, size: int, graph: bool = False) -> tuple[Tensor
         copies = w.detach().expand(size, *w.shape).requires_grad_()
         out = f(copies) + 0 * copies.sum(-1, keepdim=True)  # depends on w in any case
         units = torch.eye(size).to(w).reshape(size, *(1,) * (w.ndim - 1), size).expand_as(out)
-        options = {"create_graph": graph, "materialize_grads": True}
-        (J,) = torch.autograd.grad(out, copies, units, **options)
+        (J,) = torch.autograd.grad(out, copies, units, create_graph=graph, materialize_grads=True)
     return (out[0] if graph else out[0].detach()), J.movedim(0, -2)
 
 
