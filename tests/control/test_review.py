@@ -45,12 +45,12 @@ def weighted(R):
 MISTAKES = {
     "inputs without a weight": (
         (TWO_INPUTS, {"dR": None}),
-        ("cost", r"Raise the weights of the inputs to R=(0\.01)\."),
+        ("cost", r"Raise the weights of the inputs to R={'u1': (0\.01), 'u2': 0\.01}\."),
         weighted,
     ),
     "prices alone": (
         (LAG, {"Q": None, "dR": None, "linear": {"u1": 0.3}}),
-        ("cost", r"Raise the weights of the inputs to R=(0\.0003)\."),
+        ("cost", r"Raise the weights of the inputs to R={'u1': (0\.0003)}\."),
         weighted,
     ),
     "a set-point out of reach": (
@@ -100,7 +100,7 @@ MISTAKES = {
     ),
     "a filter that trusts all": (
         (INTEGRATOR, fast(noise=0.1, drift=1.0)),
-        ("margin", r"Slow the filter down, as by .*, noise={'y1': (1)}\), or raise dR tenfold\."),
+        ("margin", r"Slow .*, noise={'y1': (1)}\), or raise R and dR tenfold\."),
         lambda noise: fast(noise={"y1": float(noise)}, drift=1.0),
     ),
     "inputs that set-points leave free, without a weight": (
@@ -132,20 +132,21 @@ def test_a_planted_mistake_is_named_and_its_remedy_mends_it(mistake):
 NOISY = replace(read_model(LAG), noise=(np.array([[0.02]]), np.eye(1)))
 
 
-def test_the_cost_of_noise_is_that_of_the_impulse_of_each_innovation():
+def test_deviations_by_noise_are_those_of_the_impulse_of_each_innovation():
     looped, _ = controller(NOISY, u_bounds=None, y_bounds=None)
-    mpc, x, last, cost = looped.mpc, np.zeros(1), 0.0, 0.0
+    mpc, x, costs = looped.mpc, np.zeros(1), []
     for k in range(150):
         y = x + (k == 1)  # it begins at rest
         (u,) = looped.step(y, [0.0])
-        cost += float(y @ y) + 0.1 * (u - last) ** 2
-        x, last = 0.9 * (x + 0.02 * (k == 1)) + 0.5 * u, u
+        costs.append((float(y @ y), u**2))
+        x = 0.9 * (x + 0.02 * (k == 1)) + 0.5 * u
     linear, noise = LinearLoop.of(mpc, looped.observer), mpc.design.plant.noise
     assert noise is not None
-    assert linear.cost_of_noise(mpc.design, noise) == pytest.approx(cost, rel=1e-6)
+    cost, moved = linear.under(noise, mpc.design.Q)
+    assert (cost, moved[0] ** 2) == pytest.approx(np.sum(costs, 0), rel=1e-6)
     held = 1 + (0.9 * 0.02) ** 2 / (1 - 0.9**2)
     held_loop = LinearLoop.of(mpc, looped.observer, held=True)
-    assert held_loop.cost_of_noise(mpc.design, noise) == pytest.approx(held)
+    assert held_loop.under(noise, mpc.design.Q) == (pytest.approx(held), 0.0)
 
 
 def test_a_review_makes_the_tables_of_a_plan_and_its_target_once(monkeypatch):
@@ -155,18 +156,35 @@ def test_a_review_makes_the_tables_of_a_plan_and_its_target_once(monkeypatch):
     assert made_of == [looped.mpc.plan, looped.mpc.targets]
 
 
+def noisy(L=0.02, S=1e-3, A=0.9):
+    """Return the lag with another noise."""
+    return replace(NOISY, A=np.array([[A]]), noise=(np.array([[L]]), S * np.eye(1)))
+
+
 def test_a_filter_that_takes_noise_for_disturbances_is_named_and_its_remedy_mends_it():
-    fault = made(NOISY)["noise"]
-    assert not fault.ok
-    filtered = {}
-    for _ in range(8):  # tenfold each time
-        words = re.fullmatch(r"Slow .*drift={'(disturbance of y1)': (.*)}\), or .*", fault.remedy)
-        assert words, fault.remedy
-        filtered = {"drift": {words[1]: float(words[2])}}
-        if (fault := made(NOISY, filtered=filtered)["noise"]).ok:
-            break
-    assert fault.ok
-    assert made(replace(NOISY, A=np.array([[1.1]])))["noise"].ok, "it must act"
+    filtered = {"drift": 10 * controller(noisy())[0]._law.drift}
+    fault = made(noisy(), dR=1e-3, filtered=filtered)["noise"]
+    words = re.fullmatch(r"Slow .*drift={'(disturbance of y1)': (.*)}\), or .*", fault.remedy)
+    assert words, fault.text
+    filtered = {"drift": {words[1]: float(words[2])}}
+    assert made(noisy(), dR=1e-3, filtered=filtered)["noise"].ok
+    assert made(noisy(A=1.1), dR=1e-3, filtered=filtered)["noise"].ok, "it must act"
+
+
+@pytest.mark.parametrize("weights", [{"R": 1e-4}, {"R": 0.1}, {"R": 10.0, "dR": 1.0}])
+@pytest.mark.parametrize("L", [0.0, 0.1, 0.5])
+def test_what_the_default_filter_passes_on_is_the_price_of_no_offset(weights, L):
+    assert made(noisy(L), **{"dR": None, **weights})["noise"].ok
+
+
+def test_noise_that_drives_inputs_to_their_bounds_is_named_and_its_remedy_mends_it():
+    model, dR = noisy(0.5, 0.25), 1e-4
+    while not (fault := made(model, dR=dR)["noise"]).ok:
+        assert dR < 10, fault.text
+        assert "raise R and dR tenfold" in fault.remedy
+        dR *= 10
+    assert dR > 1e-4
+    assert made(model, dR=1e-4, u_bounds=None)["noise"].ok, "there is no bound"
 
 
 def loop(model, **options):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torch_qpmpc.control.design import Design, Target
+from torch_qpmpc.control.design import Target
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
@@ -66,21 +66,20 @@ class LinearLoop:
         m = self.B.shape[1] - 2 * n_y
         return self.plant[2] @ x + np.hstack((np.zeros((n_y, m)), np.eye(n_y), -np.eye(n_y)))
 
-    def cost_of_noise(self, design: Design, noise: tuple[Array, Array]) -> float:
-        """Return the mean cost of a step under a model's noise, inf without a steady state."""
+    def under(self, noise: tuple[Array, Array], Q: Array) -> tuple[float, Array]:
+        """Return the mean y'Q y and inputs' deviations by a model's noise, inf if none settle."""
         (_, _, C_c, D_c), (A, _, C), (L, S) = self.controller, self.plant, noise
-        (n_y, n), m = C.shape, self.B.shape[1] - 2 * len(C)
+        (n_y, n), m = C.shape, len(D_c)
         if not self.radius < 1:
-            return np.inf
+            return np.inf, np.full(m, np.inf)
         others = 0, len(self.A) - n
         N = self.B[:, m : m + n_y] + np.pad(A @ L, (others, (0, 0)))
         A, X = self.A, N @ S @ N.T
         for _ in range(DOUBLINGS):
             X, A = X + A @ X @ A.T, A @ A
-        y, u = np.pad(C, ((0, 0), others)), np.hstack((D_c @ C, C_c))
-        last = np.eye(m, len(A), len(A) - m)
-        parts = (design.Q, y, np.eye(n_y)), (design.R, u, D_c), (design.dR, u - last, D_c)
-        return float(sum(np.sum(W * (M @ X @ M.T + D @ S @ D.T)) for W, M, D in parts))
+        parts = (np.pad(C, ((0, 0), others)), np.eye(n_y)), (np.hstack((D_c @ C, C_c)), D_c)
+        y, u = (M @ X @ M.T + D @ S @ D.T for M, D in parts)
+        return float(np.sum(Q * y)), np.sqrt(np.diag(u))
 
     def modulus_margin(self) -> float:
         """Return the least distance of the loop's return difference at the inputs from singular.

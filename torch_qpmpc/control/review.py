@@ -23,8 +23,8 @@ from torch_qpmpc.qp.pipeline.condensing import null_space
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, HIDDEN = 0.3, 1e-3
-#: The most that a loop may cost under the log's noise, relative to a constant input.
-NOISY = 1.1
+#: The most that the log's noise moves outputs, relative to constant inputs, and inputs in bounds.
+NOISY, BUSY = 1.25, 1 / 6  # of their distance: three deviations reach from the middle to an end
 #: Offsets of the loop and ends of the reach, of set-points, and of outputs from their bounds while
 #: inputs are on levels, relative to half the distance of an output's bounds.
 OFFSET, SEEN, OUTSIDE = 1e-6, 1e-3, 0.05
@@ -126,10 +126,8 @@ def _cost(mpc: LinearMPC) -> Finding:
     ok = bool(sizes[0] > SINGULAR * sizes[-1])
     text = f"The eigenvalues of the plan's cost are {sizes[0]:.3g} to {sizes[-1]:.3g}."
     most = sizes[-1] if sizes[-1] > SINGULAR * design.typical else design.typical  # of prices
-    least = [f"{1e-3 * most / x**2:.1g}" for x in u]
-    named = ", ".join(f"{name!r}: {x}" for name, x in zip(design.plant.inputs, least, strict=True))
-    weight = least[0] if len({*least}) == 1 else f"{{{named}}}"
-    remedy = f"Raise the weights of the inputs to R={weight}."
+    least = {x: float(f"{1e-3 * most / u[i] ** 2:.1g}") for i, x in enumerate(design.plant.inputs)}
+    remedy = f"Raise the weights of the inputs to R={least}."
     if sizes[0] < -SINGULAR * abs(sizes[-1]):
         remedy = "Learning has made it indefinite: mpc.plan.reset_parameters(), or learn others."
     return Finding("cost", ok, text, remedy * (not ok))
@@ -361,11 +359,14 @@ def _margin(loop: LinearLoop, law: Law) -> Finding:
 
 
 def _noise(loop: LinearLoop, law: Law, noise: tuple[Array, Array]) -> Finding:
-    """Under the identified noise the loop costs hardly more than a constant input does."""
-    design, cost = law.design, loop.cost_of_noise(law.design, noise)
-    nothing = LinearLoop.of(law.mpc, law.observer, held=True).cost_of_noise(design, noise)
-    ok = bool(cost <= NOISY * nothing + OFFSET * design.typical)
-    text = f"Under the log's noise a step costs {cost:.4g}, and {nothing:.4g} with constant inputs."
+    """The log's noise moves outputs hardly more than if inputs rested, and no input to a bound."""
+    design, span = law.design, np.diff(law.design.u_bounds, axis=0)[0]
+    Q = design.Q if design.Q.any() else np.diag(design.typical / design.usual**2)
+    (cost, u), inputs_rest = loop.under(noise, Q), LinearLoop.of(law.mpc, law.observer, held=True)
+    more = np.sqrt(cost / (inputs_rest.under(noise, Q)[0] + OFFSET * design.typical))
+    ok = bool(more <= NOISY and (u <= BUSY * np.where(span > 0, span, np.inf)).all())
+    moved = ", ".join(map(design.plant.quantity, design.plant.inputs, u))
+    text = f"The log's noise moves {moved}, and outputs {more:.3g} times as far as without control."
     remedy = _slower("drift", design.disturbances.names, law.drift / 10)
     return Finding("noise", ok, text, remedy * (not ok))
 
@@ -373,7 +374,7 @@ def _noise(loop: LinearLoop, law: Law, noise: tuple[Array, Array]) -> Finding:
 def _slower(option: str, names: tuple[str, ...], sizes: Array) -> str:
     own = ", ".join(f"{x!r}: {size:.3g}" for x, size in zip(names, sizes, strict=True))
     own = f"qm.Controller(.., {option}={{{own}}})"
-    return f"Slow the filter down, as by {own}, or raise dR tenfold."
+    return f"Slow the filter down, as by {own}, or raise R and dR tenfold."
 
 
 def _offset(loop: LinearLoop, design: Design) -> Finding:
