@@ -206,6 +206,15 @@ def test_a_sound_design_has_no_fault(model):
     assert all(x.text[0].isupper() and x.text[-1] == "." for x in found.findings)
 
 
+def test_a_slow_mode_that_inputs_hardly_move_is_told_a_smaller_order():
+    """As of a log whose level drifts, which hides the gain: 'auto' is taken already."""
+    plant = np.diag([0.4, 0.999]), [[0.6], [-0.00098]], [[1.0, 1.0]]
+    fault = made(plant)["disturbances"]
+    assert not fault.ok
+    assert fault.remedy.startswith("Take a model of smaller order: ")
+    assert made(([[0.4]], [[0.6]]))["disturbances"].ok
+
+
 @pytest.mark.parametrize("moves", [0.01, 1.0])
 def test_a_log_that_shows_an_input_s_effect_less_than_the_noise_is_a_fault(moves):
     rng, y = np.random.default_rng(2), np.zeros(61)

@@ -49,9 +49,8 @@ class LinearLoop:
         A_c = np.vstack((np.hstack((F @ corrected, np.zeros((len(F), m)))) + G @ C_c, C_c))
         B_c = np.vstack((F @ L + G @ D_c, D_c))
         A = np.block([[plant.A + plant.B @ D_c @ plant.C, plant.B @ C_c], [B_c @ plant.C, A_c]])
-        moved = np.hstack((plant.B, plant.B @ D_c, plant.B @ K_r))
-        R_c = np.vstack((G @ K_r, K_r))
-        B = np.vstack((moved, np.hstack((np.zeros((len(A_c), m)), B_c, R_c))))
+        own = np.zeros((len(A_c), m)), B_c, np.vstack((G @ K_r, K_r))
+        B = np.block([[plant.B, plant.B @ D_c, plant.B @ K_r], [*own]])
         return cls(A, B, (A_c, B_c, C_c, D_c), (plant.A, plant.B, plant.C), mpc.design.scaling.u)
 
     @property
@@ -72,12 +71,11 @@ class LinearLoop:
         (n_y, n), m = C.shape, len(D_c)
         if not self.radius < 1:
             return np.inf, np.full(m, np.inf)
-        others = 0, len(self.A) - n
-        N = self.B[:, m : m + n_y] + np.pad(A @ L, (others, (0, 0)))
+        N = self.B[:, m : m + n_y] + np.eye(len(self.A), n) @ A @ L
         A, X = self.A, N @ S @ N.T
         for _ in range(DOUBLINGS):
             X, A = X + A @ X @ A.T, A @ A
-        parts = (np.pad(C, ((0, 0), others)), np.eye(n_y)), (np.hstack((D_c @ C, C_c)), D_c)
+        parts = (C @ np.eye(n, len(A)), np.eye(n_y)), (np.hstack((D_c @ C, C_c)), D_c)
         y, u = (M @ X @ M.T + D @ S @ D.T for M, D in parts)
         return float(np.sum(Q * y)), np.sqrt(np.diag(u))
 
@@ -102,8 +100,7 @@ def _gains(mpc: LinearMPC) -> tuple[Array, Array, Array]:
     design, plan, target = mpc.design, make_tables(mpc.plan), make_tables(mpc.targets)
     n, m, n_y, n_d = design.plant.sizes
     n_w = len(design.disturbances.names)
-    signals = torch.eye(n + n_w + m + n_y, dtype=torch.float64)
-    signals = torch.cat((torch.zeros_like(signals[:1]), signals))
+    signals = torch.eye(1 + n + n_w + m + n_y, dtype=torch.float64)[:, 1:]
     x, w, u_last, r = signals.split((n, n_w, m, n_y), dim=-1)
     s = torch.cat((r, w, r.new_zeros(len(r), n_d), r.new_ones(len(r), 1)), -1)
     state = torch.cat((s.new_zeros(len(s), design.steady.anchors), s), -1)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
 from torch_qpmpc.control.design import DECIDES, Design, Target
-from torch_qpmpc.control.disturbance import TINY, unseen_modes
+from torch_qpmpc.control.disturbance import TINY, choose, unseen_modes
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC
@@ -210,13 +210,16 @@ def _horizon(design: Design) -> Finding:
 def _disturbances(design: Design) -> Finding:
     """The outputs tell the disturbances from the state."""
     plant, w = design.normal.plant, design.normal.disturbances
+    if not w.names:
+        return Finding("disturbances", True, "None is estimated.")
     matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
     _, sizes, V = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
-    ok = not w.names or bool(sizes[-1] > HIDDEN)
-    told = f"The outputs {'' if ok else 'hardly '}tell the {', '.join(w.names)} from the state"
-    text = f"{told} (singular value {sizes[-1]:.2g})." if w.names else "None is estimated."
-    hidden = w.names[int(np.abs(V[-1, len(plant.A) :]).argmax())] if w.names else ""
-    remedy = f"Take disturbances='auto': the {hidden} looks like a slow mode."
+    ok, hidden = bool(sizes[-1] > HIDDEN), np.abs(V[-1, len(plant.A) :]).argmax()
+    text = f"The outputs {'' if ok else 'hardly '}tell the {', '.join(w.names)} from the state "
+    text += f"(singular value {sizes[-1]:.2g})."
+    remedy = f"Take disturbances='auto': the {w.names[hidden]} looks like a slow mode."
+    if not ok and choose(design.plant, "auto", design.scaling).names == w.names:
+        remedy = "Take a model of smaller order: this one has a slow mode that inputs hardly move."
     return Finding("disturbances", ok, text, remedy * (not ok))
 
 
