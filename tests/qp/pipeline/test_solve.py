@@ -1,6 +1,10 @@
+import itertools
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -8,9 +12,19 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.benchmarks.stays import of_step, of_value
+import torch_qpmpc
 from tests.problems import KnownQP, certified, known_qp, normal
-from torch_qpmpc import QPMPC, QPError, QuadraticProgram, SolveLog, SolverError, Status, solve_qp
+from torch_qpmpc import (
+    QPMPC,
+    Controller,
+    LinearMPC,
+    QPError,
+    QuadraticProgram,
+    SolveLog,
+    SolverError,
+    Status,
+    solve_qp,
+)
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs
@@ -20,6 +34,7 @@ from torch_qpmpc.qp.program import UNKNOWN
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS, Backend, BackendSolution, daqp, interior_point
 
+ROOT = str(Path(torch_qpmpc.__file__).parent)
 BATCH = 6
 
 
@@ -432,10 +447,33 @@ def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
     assert solution.iterations.max() < 100
 
 
+def files_called(call: Callable[[], Any]) -> list[str]:
+    """Return the package's files that a call passes through, in its order."""
+    files: list[str] = []
+
+    def note(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(ROOT):
+            files.append(frame.f_code.co_filename)
+
+    call()  # so that nothing is left to compile or prepare
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        call()
+    finally:
+        sys.setprofile(before)
+    return [file for file, _ in itertools.groupby(files)]
+
+
 def test_a_value_and_a_step_change_files_seldom():
-    """`python -m tests.benchmarks.stays` counts; a reader changes page as often."""
-    journey = of_value("daqp")
-    assert journey.stays <= 26
-    assert journey.returns <= 14
-    assert journey.files <= 12
-    assert of_step().stays <= 30
+    """A reader of the call changes page as often."""
+    A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
+    bounds: Any = {"state_bounds": ([-1.0, -1.0], [1.0, 1.0]), "action_bounds": ([-1.0], [1.0])}
+    mpc = QPMPC.from_model(A, B, 10, stage_weight=[1.0, 0.1, 0.01], solver="daqp", **bounds)
+    files = files_called(lambda: mpc.value(torch.tensor([[0.3, -0.2]]).double()))
+    assert len(files) <= 26
+    assert len(files) - len(set(files)) <= 14
+    assert len(set(files)) <= 12
+    linear = LinearMPC((A, B, [[1.0, 0.0]]), 10, Q=[1.0], dR=[0.1], u_bounds=(-1.0, 1.0))
+    controller = Controller(linear)
+    assert len(files_called(lambda: controller.step([0.1], [0.5]))) <= 30
