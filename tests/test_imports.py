@@ -47,3 +47,8 @@ def test_every_public_name_is_there_and_listed():
 def test_gymnasium_has_the_ids():
     registered = [name for name in gymnasium.registry if name.startswith("torch_qpmpc/")]
     assert registered == [f"torch_qpmpc/{name}-v0" for name in ("PointMass", "GrosZanonLTI")]
+
+
+def test_errors_are_caught_as_the_builtin_ones():
+    assert issubclass(torch_qpmpc.QPError, ValueError)
+    assert issubclass(torch_qpmpc.SolverError, RuntimeError)
