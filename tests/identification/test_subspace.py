@@ -78,19 +78,16 @@ def late_log(delay: int, noise: float) -> dict[str, np.ndarray]:
     return {"y": y + noise * rng.normal(size=1201), "u": u}
 
 
-def test_an_order_is_that_of_a_dead_time_beyond_the_horizons_that_decide():
-    """The singular vectors of twenty predictions were at most twenty states: it was 0."""
-    found = qm.identify(late_log(24, 0.02), order=25)
-    assert found.fit.order == 25
-    assert found.R2[-1].item() > 0.99
-
-
+@pytest.mark.usefixtures("rough_fits")
 def test_a_dead_time_beyond_the_orders_is_told_with_the_order_that_finds_it():
-    log = qm.read_log(late_log(30, 0.1), outputs=["y"], inputs=["u"])
-    with pytest.warns(UserWarning, match="^y follows u1 3[01] rows late: .* pass order=") as told:
+    """The singular vectors of twenty predictions were at most twenty states: none was of 26."""
+    log = qm.read_log(late_log(24, 0.1), outputs=["y"], inputs=["u"])
+    with pytest.warns(UserWarning, match="^y follows u1 2[45] rows late: .* pass order=") as told:
         assert qm.identify(log).R2[-1] < 0.5
     order = int(str(told[0].message).rstrip(".").split("=")[1])
-    assert qm.identify(log, order=order).R2[-1] > 0.97
+    found = qm.identify(log, order=order)
+    assert found.fit.order == order > 24
+    assert found.R2[-1] > 0.99
 
 
 def cycle() -> dict[str, np.ndarray]:
