@@ -155,6 +155,7 @@ def test_a_simulation_may_start_anywhere_in_the_range_of_the_log(pieces):
         assert found_off < 1.5 * own_off + 0.02
 
 
+@pytest.mark.usefixtures("rough_fits")
 @pytest.mark.parametrize("kind", ["a fifth", "every third row"])
 def test_missing_outputs_cost_only_their_information(kind):
     log, new = tank(400, 40, 11), tank(300, 45, 12)
