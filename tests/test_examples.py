@@ -35,6 +35,7 @@ def test_an_example_learns_for_two_updates(name, tmp_path):
     assert len(file.read_text(encoding="utf-8").splitlines()) <= 200
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_the_heat_pump_costs_less_than_a_thermostat_and_no_less_than_the_bound():
     drawn = runpy.run_path(str(FOLDER / "heat_pump.py"))
     one, steps = drawn["days"](2, 5), 96
