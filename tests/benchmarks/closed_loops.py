@@ -25,7 +25,7 @@ import torch
 import torch_qpmpc as qm
 from tests.benchmarks import outside
 from tests.benchmarks.improvement import SHORT_EPISODES
-from tests.benchmarks.table import DOCS, keep, options_of
+from tests.benchmarks.table import DOCS, keep, options_of, table, write_section
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.algorithms import evaluate
@@ -34,7 +34,6 @@ from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.identified import identified_start
 from torch_qpmpc.learning.operators import warm_policy
 from torch_qpmpc.mpc.tightening import prediction_covariance, tighten
-from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "closed_loops.csv"
 SEEDS = range(16, 36)

@@ -27,8 +27,7 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import moreau
 from tests.benchmarks.problems import PAPER, make_mpc, transitions
 from tests.benchmarks.reference import relative_error
-from tests.benchmarks.table import PAGE, significant
-from torch_qpmpc.study.markdown import table, write_section
+from tests.benchmarks.table import publish, significant, table
 
 GPU = torch.device("cuda")
 BATCHES = (4_096, 65_536, 262_144)
@@ -210,10 +209,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if not torch.cuda.is_available():
         raise SystemExit("python -m tests.benchmarks.gpu: torch sees no CUDA device")
-    text = report(GPU)
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "gpu")
+    publish(report(GPU), "gpu", options.write)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from torch import Tensor
 from tests.benchmarks.peers import PEERS, Values
 from tests.benchmarks.problems import GAMMA, PAPER, Transitions, make_mpc, move, nudge, transitions
 from tests.benchmarks.reference import WRONG, reference_values, relative_error
-from tests.benchmarks.table import PAGE, significant, table, write_section
+from tests.benchmarks.table import publish, significant, table
 from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.qp.solvers import BACKENDS
 
@@ -211,9 +211,7 @@ def main() -> None:
         "largest relative errors for a dense C: of values, with the number wrong by more than "
         f"1e-6, and of gradients.\n\n{gradients(rows)}"
     )
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "benchmark")
+    publish(text, "benchmark", options.write)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 import train
-from tests.benchmarks.table import DOCS, keep, options_of
+from tests.benchmarks.table import DOCS, keep, options_of, table, write_section
 from tests.runs import make_config
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.evaluation import cost_text
@@ -24,7 +24,6 @@ from torch_qpmpc.experiment.plots import experience
 from torch_qpmpc.experiment.rivals import IDENTIFICATION, ZERO_ACTION
 from torch_qpmpc.experiment.start import collect_log
 from torch_qpmpc.experiment.tasks import find_task, make_physics
-from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = (DOCS / "results" / f"improvement.{end}" for end in ("md", "csv"))
 #: Seeds of the runs, and of the evaluation.

@@ -37,10 +37,10 @@ from torch import Tensor, nn
 import torch_qpmpc as qm
 from tests.benchmarks.export import compiled
 from tests.benchmarks.improvement import PAGE
+from tests.benchmarks.table import publish, table
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.envs.linear_system import LinearSystem, normal, uniform
 from torch_qpmpc.export.library import required_compiler
-from torch_qpmpc.study.markdown import table, write_section
 
 #: Seconds of a step, the soft bounds, limits of forces and moves, and the price of a violation.
 DT, BOUND, FORCE, MOVE, PRICE = 0.15, 0.35, 1.0, 0.2, 20.0
@@ -280,10 +280,7 @@ def main() -> None:
         numbers = f"{np.median(own):.3f}", f"{min(own):.3f} to {max(own):.3f}"
         rows.append([name, *numbers, on_a_controller(designs[name], masses(seed), seed)])
     head = ["J relative to N = 40", "median", "range", "kB, microseconds in C"]
-    text = table(head, rows)
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "micro-controller")
+    publish(table(head, rows), "micro-controller", options.write, PAGE)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 from tests.benchmarks import outside
 from tests.benchmarks.plants import CONVERSE, Converse, pendulum, swing
-from tests.benchmarks.table import DOCS, options_of, significant
+from tests.benchmarks.table import DOCS, options_of, significant, table, write_section
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import NONLINEAR, candidates
@@ -49,7 +49,6 @@ from torch_qpmpc.experiment.rivals import zero_action
 from torch_qpmpc.experiment.start import collect_log, make_start
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import table, write_section
 
 RESULTS, HERE = DOCS / "results" / "nonlinear.csv", "tests.benchmarks.nonlinear"
 SEEDS = (501, 502, 503)

@@ -26,10 +26,9 @@ import torch
 import torch_qpmpc as qm
 from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import clarabel_step, osqp_step
-from tests.benchmarks.table import PAGE, significant
+from tests.benchmarks.table import publish, significant, table
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers.daqp import NO_BOUND, RECIPROCAL_RHO, SOFT
-from torch_qpmpc.study.markdown import table, write_section
 
 STEPS, FEW, BLOCK, KICK, PASSES = 10_000, 200, 200, 50, 3
 SIZES = {"N = 10, 2 states": (10, 2, 1), "N = 50, 8 states": (50, 8, 2)}
@@ -187,9 +186,7 @@ def main(arguments: list[str] | None = None) -> int:
         f"thread unless a row says default threads, here {default} on {os.cpu_count()} cores."
         f"\n\n{table(['', *columns], lines)}"
     )
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "one state")
+    publish(text, "one state", options.write)
     return 0
 
 

@@ -17,26 +17,23 @@ docs/results/outside.md.
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib.util
 import math
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import pandas as pd
 import torch
 from scipy.optimize import linprog
 
 from tests.benchmarks import plants
-from tests.benchmarks.table import DOCS, options_of
+from tests.benchmarks.table import DOCS, keep, options_of, table, write_section
 from tests.runs import compose_config
 from torch_qpmpc.experiment.algorithms import evaluate
 from torch_qpmpc.experiment.choosing import LINEAR
@@ -47,15 +44,12 @@ from torch_qpmpc.experiment.start import make_start
 from torch_qpmpc.experiment.tasks import AnyPlant, make_mpc, make_physics
 from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.learning.operators import warm_policy
-from torch_qpmpc.study.markdown import table, write_section
 
 PAGE = DOCS / "results" / "outside.md"
 RESULTS = DOCS / "results" / "outside.csv"
 SEEDS, EVAL_SEED = (1, 2, 3), 9002
 #: Rows of the table: a cost that is above zero action's by more than this many standard errors.
 ERRORS = 2.0
-FIELDS = ("plant", "seed", "zero", "random", "start", "excess", "error", "chosen", "R2_cost")
-FIELDS += ("order", "reference", "transitions", "choosing", "seconds")
 #: The module that `gymnasium.make` imports for an id of a shim.
 HERE = "tests.benchmarks.outside"
 
@@ -360,9 +354,9 @@ def run(name: str, seed: int) -> dict[str, Any]:
     row = {"plant": name, "seed": seed, **{key: x.mean().item() for key, x in costs.items()}}
     row |= {"excess": excess.mean().item(), "error": (excess.std() / len(excess) ** 0.5).item()}
     summary = start.summary
-    row |= {"chosen": summary["start"], "choosing": summary["start_transitions"]}
-    row |= {"R2_cost": start.cost.R2 if start.cost else math.nan, "order": summary["order"]}
-    row |= {"reference": reference(PLANTS[name]), "transitions": cfg.start.transitions}
+    row |= {"chosen": summary["start"], "R2_cost": start.cost.R2 if start.cost else math.nan}
+    row |= {"order": summary["order"], "reference": reference(PLANTS[name])}
+    row |= {"transitions": cfg.start.transitions, "choosing": summary["start_transitions"]}
     return row | {"seconds": round(seconds, 1)}
 
 
@@ -403,28 +397,16 @@ def outcomes(rows: Any) -> str:
     return f"{table(head, lines)}\n\n{total}"
 
 
-def finished(path: Path, name: str, seed: int) -> dict[str, Any] | None:
-    """Return the row of a plant and a seed, if the file has it."""
-    rows: Any = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=FIELDS)
-    mine = rows[(rows["plant"] == name) & (rows["seed"] == seed)]
-    return mine.iloc[0].to_dict() if len(mine) else None
-
-
-def add(path: Path, row: dict[str, Any]) -> None:
-    """Append a row, or put it in the place of the one of its plant and seed."""
-    rows: list[Any] = []
-    if path.exists():
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-    # Six digits.
-    short = {key: f"{x:.6g}" if isinstance(x, float) else str(x) for key, x in row.items()}
-    same = [i for i, x in enumerate(rows) if all(x[k] == short[k] for k in ("plant", "seed"))]
-    at = same[0] if same else len(rows)
-    rows[at : at + 1] = [short]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, FIELDS, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def cases(seeds: Iterable[int], parts: Iterable[str]) -> Iterator[tuple[str, int]]:
+    """Yield plants whose names have one of ``parts`` and whose package is there, and seeds."""
+    for seed in seeds:
+        for name, plant in PLANTS.items():
+            if not any(part in name for part in parts):
+                continue
+            if importlib.util.find_spec(plant.package):
+                yield name, seed
+            else:
+                print(f"skipped: {name}, which needs {plant.package}")
 
 
 def main(arguments: Iterable[str] | None = None) -> None:
@@ -435,17 +417,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore", category=UserWarning)  # rows have what they say
-    for seed in options.seeds:
-        for name, plant in PLANTS.items():
-            if not any(part in name for part in options.plants):
-                continue
-            if importlib.util.find_spec(plant.package) is None:
-                print(f"skipped: {name}, which needs {plant.package}")
-                continue
-            if (row := finished(options.results, name, seed)) is None:
-                add(options.results, row := run(name, seed))
-                print(*row.values(), flush=True)
-    rows: Any = pd.read_csv(options.results)
+    rows = keep(options.results, cases(options.seeds, options.plants), run, "plant", "nan")
     write_section(options.page, outcomes(rows), "starts")
 
 

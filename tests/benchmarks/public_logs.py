@@ -21,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 import torch_qpmpc as qm
-from torch_qpmpc.study.markdown import table, write_section
+from tests.benchmarks.table import DOCS, table, write_section
 
-PAGE = Path(__file__).parents[2] / "docs" / "results" / "outside.md"
+PAGE = DOCS / "results" / "outside.md"
 ROWS, SPLITS, CHOOSING, AHEAD, SETTLED = 2000, (0.5, 0.6, 0.7), 0.3, 20, 20
 LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20)
 

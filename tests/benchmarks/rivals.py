@@ -41,7 +41,7 @@ from torch import Tensor
 
 import torch_qpmpc as qm
 import train
-from tests.benchmarks.table import DOCS, options_of
+from tests.benchmarks.table import DOCS, options_of, table, write_section
 from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
@@ -51,7 +51,6 @@ from torch_qpmpc.experiment.tasks import Task, plant_layout, register
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
-from torch_qpmpc.study.markdown import table, write_section
 
 PAGE, RESULTS = DOCS / "results" / "improvement.md", DOCS / "results" / "rivals.csv"
 SIZES, SEEDS, EVALUATION = (2000,), range(3041, 3061), 50_000

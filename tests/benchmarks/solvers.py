@@ -28,12 +28,11 @@ from tests.benchmarks.full_space import FullSpace
 from tests.benchmarks.peers import clarabel_step, cvxpylayers, osqp_step, piqp_step, values_of
 from tests.benchmarks.problems import Size, make_mpc, nudge, transitions
 from tests.benchmarks.reference import reference_values, relative_error
-from tests.benchmarks.table import PAGE, significant
+from tests.benchmarks.table import publish, significant, table
 from torch_qpmpc import QPMPC, solve_qp
 from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.solvers import BACKENDS
-from torch_qpmpc.study.markdown import table, write_section
 
 #: QPs in our batches, in the others' loops, and compared with the reference.
 BATCH, LOOP, CHECKED = 32, 4, 2
@@ -200,9 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
             own_models(),
         ]
     )
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "solvers")
+    publish(text, "solvers", options.write)
     return 0
 
 

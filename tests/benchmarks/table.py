@@ -10,7 +10,8 @@ import pandas as pd
 
 from torch_qpmpc.study.markdown import table, write_section
 
-__all__ = ["DOCS", "PAGE", "ROOT", "keep", "options_of", "significant", "table", "write_section"]
+__all__ = ["DOCS", "PAGE", "ROOT", "keep", "options_of", "publish", "significant", "table"]
+__all__ += ["write_section"]
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -22,6 +23,13 @@ def significant(x: float) -> str:
     if x >= 100:
         return f"{int(float(f'{x:.3g}')):,}"
     return f"{x:.{max(0, 2 - math.floor(math.log10(x)))}f}"
+
+
+def publish(text: str, marker: str, write: bool, page: Path = PAGE) -> None:
+    """Print a table, and ``write`` it to its place in a page."""
+    print(text)
+    if write:
+        write_section(page, text, marker)
 
 
 def options_of(
@@ -39,14 +47,18 @@ def options_of(
 
 
 def keep(
-    path: Path, keys: Iterable[tuple[str, int]], run: Callable[[str, int], dict[str, Any]]
+    path: Path,
+    keys: Iterable[tuple[str, int]],
+    run: Callable[[str, int], dict[str, Any]],
+    by: str = "case",
+    na_rep: str = "",
 ) -> Any:
-    """Return the rows of a file by case and seed, with those that it lacks, each kept at once."""
+    """Return the rows of a file ``by`` and seed, with those that it lacks, each kept at once."""
     rows: Any = pd.read_csv(path) if path.exists() else pd.DataFrame()
-    done = {*rows[["case", "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
+    done = {*rows[[by, "seed"]].itertuples(index=False, name=None)} if len(rows) else {}
     for key in keys:
         if key not in done:
             rows = pd.concat([rows, pd.DataFrame([row := run(*key)])])
-            rows.to_csv(path, index=False, float_format="%.6g")
+            rows.to_csv(path, index=False, float_format="%.6g", na_rep=na_rep)
             print(*row.values(), flush=True)
     return rows

@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 import torch_qpmpc as qm
-from tests.benchmarks.table import DOCS
-from torch_qpmpc.study.markdown import table, write_section
+from tests.benchmarks.table import DOCS, publish, table
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 Q, R, N = np.eye(2), 0.1 * np.eye(1), 30
@@ -165,11 +164,7 @@ def main(write: bool) -> None:
         cells = f"{loop.cost:.5f}", f"{off:.0e}" if off else "", f"{first:.2f}", f"{ratio:.3g}"
         rows.append([f"{name} {number}".strip(), *cells, f"{1e3 * step:.3g}"])
     head = ["package", "cost", "inputs off by", "start and first step, s", "a step", "in ms"]
-    text = table(head, rows)
-    print(text)
-    if write:
-        page = DOCS / "results" / "conventions.md"
-        write_section(page, text, "toolboxes")
+    publish(table(head, rows), "toolboxes", write, DOCS / "results" / "conventions.md")
 
 
 if __name__ == "__main__":

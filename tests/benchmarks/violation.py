@@ -8,14 +8,13 @@ Seeds 0 to 3 chose the step whose errors count.
 """
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 import torch_qpmpc as qm
-from torch_qpmpc.study.markdown import table, write_section
+from tests.benchmarks.table import DOCS, publish, table
 
 KINDS = ("normal", "heavy-tailed", "coloured")
 SHARES = (None, 0.2, 0.05, 0.01)
@@ -23,7 +22,7 @@ QUANTILE = "quantile"
 #: The first step that an input decides.
 AHEAD = 2
 HORIZON, SETTLED, BOUND, BEYOND, FIRST = 12, 50, 6.0, 7.0, 100
-PAGE = Path(__file__).parents[2] / "docs/results/conventions.md"
+PAGE = DOCS / "results" / "conventions.md"
 A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.0], [0.2]]), np.array([[1.0, 0.0]])
 
 
@@ -103,10 +102,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    text = rates(options.seeds, options.steps)
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "violation")
+    publish(rates(options.seeds, options.steps), "violation", options.write, PAGE)
 
 
 if __name__ == "__main__":

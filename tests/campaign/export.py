@@ -13,14 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.table import DOCS, table, write_section
 from tests.campaign.exports import PROBLEMS
 from tests.exported import read
 from torch_qpmpc import export_c
 from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.qp.program import Status as Outcome
-from torch_qpmpc.study.markdown import table, write_section
 
-PAGE = Path(__file__).parents[2] / "docs" / "reliability" / "measured.md"
+PAGE = DOCS / "reliability" / "measured.md"
 #: The bounds on differences of actions, and of values relative to 1 + |V|.
 LARGEST = 1e-6, 1e-8
 CHUNK = 5000

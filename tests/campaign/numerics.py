@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from tests.benchmarks.table import DOCS, table, write_section
+from tests.benchmarks.table import DOCS, publish, table
 from tests.problems import KnownQP, known_qp, normal
 from torch_qpmpc import QuadraticProgram, solve_qp
 from torch_qpmpc.qp.program import TOLERANCE
@@ -48,9 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     rows = [measure(solver) for solver in options.solver]
     lines = [[name, *(row[i] for row in rows)] for i, name in enumerate(NAMES)]
     text = table(["largest relative error", *options.solver], lines)
-    print(text)
-    if options.write:
-        write_section(PAGE, text, "numerics")
+    publish(text, "numerics", options.write, PAGE)
 
 
 def measure(solver: str) -> list[str]:
