@@ -146,9 +146,7 @@ def test_a_converged_plan_is_a_local_minimum_of_the_simulated_cost(priced):
 
 CASES: list[dict[str, Any]] = [
     {},
-    {"priced": True},
-    {"known": True},
-    {"known": True, "priced": True, "gamma": 1.0},
+    {"known": True, "priced": True},
     {"state_bounds": ([-1.0, -0.4], [1.0, 0.4]), "state_slack": 5.0},
     {"state_bounds": ([-9.0, -0.8], [9.0, 0.8]), "state_slack": torch.inf},
     {"blocks": (1, 2, 2)},
