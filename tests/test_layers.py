@@ -9,16 +9,15 @@ IMPORTS = {
     "errors": "",
     "checks": "errors",
     "files": "errors",
-    "loops": "",  # the closed loop of a policy and a plant
     "qp": "errors checks",
     "identification": "errors checks qp",  # models from logs; knows no QPMPC
     "mpc": "errors checks files qp identification",
     "export": "errors checks qp mpc",
     "proofs": "errors checks qp mpc export",
     "learning": "errors checks qp identification mpc",
-    "envs": "errors checks loops identification mpc",
+    "envs": "errors checks identification mpc",
     "analysis": "errors checks qp mpc",
-    "control": "errors checks files loops qp identification mpc export learning analysis",
+    "control": "errors checks files qp identification mpc export learning analysis",
     "experiment": "errors checks files qp identification mpc export learning envs analysis",
     "study": "errors checks files qp identification mpc learning envs analysis experiment",
     "report": "study",  # `python -m torch_qpmpc.report`

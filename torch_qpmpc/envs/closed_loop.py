@@ -17,7 +17,6 @@ from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import LinearSystem
 from torch_qpmpc.envs.plant import Plant
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.loops import Step, run_loop
 
 POLICY_REMEDY = "Map a batch of states to a batch of actions."
 #: A plant of any kind.
@@ -108,33 +107,30 @@ def closed_loop(
     check_whole("starts", starts, 1)
     check_seed(seed)
     episodes = _begun(plant, policy, length, starts, seed)
-    lengths, action = np.zeros(starts), torch.zeros(())
-
-    def act(p: Tensor) -> Tensor:
-        nonlocal lengths, action
+    lengths, known, done, action = np.zeros(starts), episodes.known, [], torch.zeros(())
+    # A result of shape (starts,) or (n_u,) would broadcast silently.
+    options = {"batched": False, "remedy": POLICY_REMEDY}
+    for _ in range(length):
         if not episodes.over.all():
-            # A result of shape (starts,) or (n_u,) would broadcast silently.
-            sizes = starts, len(plant.lb_a)
-            action = check_tensor(
-                "policy(s)", policy(p), *sizes, batched=False, remedy=POLICY_REMEDY
-            )
+            action = check_tensor("policy(s)", policy(known), starts, len(plant.lb_a), **options)
         lengths += ~episodes.over
-        return action
-
-    known, actions, costs = zip(*run_loop(act, episodes.known, episodes.step, length), strict=True)
+        known, *_ = step = episodes.step(action)
+        done.append(step)
     episodes.close()
-    seen = torch.stack((episodes.known, *known)), torch.stack(actions), torch.stack(costs)
-    return ClosedLoop(*seen, plant.n_x, _float64(lengths), torch.as_tensor(episodes.raised))
+    seen, actions, costs = map(torch.stack, zip(*done, strict=True))
+    seen, raised = torch.cat((episodes.known[None], seen)), torch.as_tensor(episodes.raised)
+    return ClosedLoop(seen, actions, costs, plant.n_x, _float64(lengths), raised)
 
 
 class _Episodes(NamedTuple):
     """Episodes that have begun: what the policy sees first, and their step.
 
-    Each step marks the episodes that are ``over``, and those that have ``raised``.
+    A step maps actions to what the policy sees next, the applied actions and the costs. It marks
+    the episodes that are ``over``, and those that have ``raised``.
     """
 
     known: Tensor
-    step: Callable[[Tensor], Step]
+    step: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
     over: np.ndarray
     raised: np.ndarray
     close: Callable[[], object] = lambda: None
@@ -153,13 +149,13 @@ def _(plant: LinearSystem, policy: object, steps: int, starts: int, seed: int) -
     s = plant.starts(rng, starts)
     nu, never = torch.zeros_like(s), np.zeros(starts, dtype=bool)
 
-    def step(a: Tensor) -> Step:
+    def step(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         nonlocal s, nu
         a = plant.applied(a)
         cost = plant.cost(s, a)
         nu = plant.noise(nu, plant.draw(rng, starts))
         s = plant.step(s, a, nu)
-        return Step(s, a, cost)
+        return s, a, cost
 
     return _Episodes(s, step, never, never)
 
@@ -179,14 +175,14 @@ def _(plant: Plant, policy: object, steps: int, starts: int, seed: int) -> _Epis
         ahead = w[:, k : k + plant.horizon + 1, : plant.n_d]
         return torch.cat((ahead.flatten(1), seen), -1)
 
-    def step(a: Tensor) -> Step:
+    def step(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         nonlocal k, x, seen
         u = plant.applied(a)
         cost = plant.cost(x, u, w[:, k])
         x = plant.step(x, u, w[:, k])
         k, d, y = k + 1, w[:, k, : plant.n_d], plant.output(x, w[:, k + 1])
         seen = y if observer is None else observer.following(seen, u, d, y, k)
-        return Step(known(), u, cost)
+        return known(), u, cost
 
     never = np.zeros(starts, dtype=bool)
     return _Episodes(known(), step, never, never)
@@ -201,7 +197,7 @@ def _(plant: GymnasiumPlant, policy: object, steps: int, starts: int, seed: int)
     (over, raised), k = np.zeros((2, starts), dtype=bool), 0
     low, high = plant.lb_a.numpy(), plant.ub_a.numpy()
 
-    def step(a: Tensor) -> Step:
+    def step(a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         nonlocal s, y, k
         applied = a.numpy().clip(low, high)
         y, cost, going, k = y.copy(), np.zeros(starts), torch.as_tensor(~over)[:, None], k + 1
@@ -215,7 +211,7 @@ def _(plant: GymnasiumPlant, policy: object, steps: int, starts: int, seed: int)
         if observer is not None:
             now = observer.following(s, u, s[:, :0], now, k)
         s = torch.where(going, now, s)
-        return Step(s, u, _float64(cost))
+        return s, u, _float64(cost)
 
     return _Episodes(s, step, over, raised, lambda: [env.close() for env in envs])
 

@@ -211,21 +211,6 @@ def preview_key(mpc: QPMPC) -> str | None:
 
 def warm_policy(mpc: QPMPC) -> Callable[[Tensor], Tensor]:
     """Return `QPMPC.policy` for one closed loop: each call starts from the last active sets."""
-    return in_closed_loop(QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET))
-
-
-def in_closed_loop(actor: TensorDictModuleBase, n_preview: int = 0) -> Callable[[Tensor], Tensor]:
-    """Return an actor as a function from p to a, for one closed loop.
-
-    The first ``n_preview`` entries of p are the actor's ``preview``, the others its
-    ``observation``. Other entries that the actor writes, such as active sets, are inputs of its
-    next call.
-    """
-    carried = TensorDict()
-
-    def policy(p: Tensor) -> Tensor:
-        if n_preview:
-            carried.set(PREVIEW, p[..., :n_preview])
-        return actor(carried.set("observation", p[..., n_preview:]))["action"]
-
-    return policy
+    actor = QPActorValueOperator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    carried = TensorDict()  # the observation, the action and the active sets
+    return lambda p: actor(carried.set("observation", p))["action"]
