@@ -14,7 +14,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,17 +43,13 @@ from torch_qpmpc.mpc.validation import check_no_levels
 
 #: Number of parts that a log is cut into; the last one is held out.
 PARTS = 3
+#: The plant of the loops with a log.
+LAST = "a model of the log's last third"
 #: The least gain, as a share of the old cost, that pairs must show, and the most that inputs may
 #: explain of the residuals of their rows, in feedback, where a model decides.
 GAIN, FED_BACK = 0.01, 0.5
-
-
-class Plant(NamedTuple):
-    """The plant of the loops, in words and as `simulate` takes it, and the options of a loop."""
-
-    name: str
-    plant: Any
-    options: Callable[[np.random.Generator], dict[str, Any]]
+#: Maps a law and the entropy of set-points and noise to a closed loop.
+Loop = Callable[[Law, tuple[int, ...]], Run]
 
 
 @dataclass(frozen=True)
@@ -113,28 +109,32 @@ def learn(
     check_seed(seed)
     if hasattr(source, "reset"):
         middle = law.read_set_points(r, 1, memory.r)[0]
-        size = _sizes(law.design, spread, SMALL * law.design.usual)
+        size, name = _sizes(law.design, spread, SMALL * law.design.usual), "the environment"
 
-        def options(rng: np.random.Generator) -> dict[str, Any]:
-            return {"known": known, "r": _levels(law.design, middle, size, steps, rng)}
+        def loop(law: Law, entropy: tuple[int, ...]) -> Run:
+            rng = np.random.default_rng(entropy)
+            options = {"seed": int(rng.integers(2**31)), "known": known}
+            levels = _levels(law.design, middle, size, steps, rng)
+            return simulate(law, memory, source, steps, levels, **options)
 
-        plant = Plant("the environment", source, options)
-        log = _gathered(law, memory, plant, -(-transitions // steps), steps, seed)
+        log = _gathered(loop, law, -(-transitions // steps), seed)
     elif known is not None:
         raise QPError.expected("known", "signals beside a log", "None: the log has its own")
     else:
         log, held_out = _parts(_checked(as_log(source), law.design.plant))
         middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
-        plant = _model(law.design, held_out, middle, spread, steps)
+        loop, name = _with_log(law.design, memory, held_out, middle, spread, steps), LAST
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
-    test, costs = _compare(law, candidate, memory, plant, steps, pairs, seed)
+    test, costs = _compare(loop, law, candidate, pairs, seed)
     before, after = np.mean(costs, axis=0).tolist()
     shown = test.decision == "better", before, after, test.pairs, test.interval
-    return LearningReport(*shown, steps, log.steps, plant.name, model), candidate
+    return LearningReport(*shown, steps, log.steps, name, model), candidate
 
 
-def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) -> Plant:
+def _with_log(
+    design: Design, memory: Memory, held_out: Log, middle: Any, spread: Any, steps: int
+) -> Loop:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
     identified = _identified(held_out, design.plant)
     if (share := explained_by_inputs(identified.model, held_out.trajectories).max()) > FED_BACK:
@@ -143,19 +143,20 @@ def _model(design: Design, held_out: Log, middle: Any, spread: Any, steps: int) 
         raise QPError.expected("log", got, "some that also move by themselves", remedy)
     d = torch.cat([one.d for one in held_out.trajectories]).numpy()
     middle, size = _set_points(design, held_out, middle, spread)
-    noise = np.sqrt(np.diag(identified.fit.model.S))
     model = read_model(identified, prices=design.linear.values())
     own = replace(design, plant=model, disturbances=choose(model, None))
     x, u, *_ = LinearMPC.of_design(own).target(middle, known=d.mean(0))
-    rest, ends = {"x": x.numpy(), "u": u.numpy()}, len(d) - 1
+    rest = {"x": x.numpy(), "u": u.numpy(), "noise": np.sqrt(np.diag(identified.fit.model.S))}
 
-    def options(rng: np.random.Generator) -> dict[str, Any]:
+    def loop(law: Law, entropy: tuple[int, ...]) -> Run:
+        rng = np.random.default_rng(entropy)
+        noise = int(rng.integers(2**31))
         levels = _levels(design, middle, size, steps, rng)
         start = int(rng.integers(max(len(d) - steps, 1)))
-        known = d[np.minimum(start + np.arange(steps), ends)]
-        return {"known": known, "r": levels, "noise": noise, **rest}
+        known = d[np.minimum(start + np.arange(steps), len(d) - 1)]
+        return simulate(law, memory, model, steps, levels, seed=noise, known=known, **rest)
 
-    return Plant("a model of the log's last third", model, options)
+    return loop
 
 
 def _set_points(design: Design, log: Log, middle: Any, spread: Any) -> tuple[Array, Array]:
@@ -183,20 +184,14 @@ def _levels(
     return np.clip(levels, *design.y_bounds).repeat(hold, axis=0)
 
 
-def _gathered(law: Law, memory: Memory, plant: Plant, loops: int, steps: int, seed: int) -> Log:
+def _gathered(loop: Loop, law: Law, loops: int, seed: int) -> Log:
     """Return closed loops with moving set-points as a log."""
     bar = tqdm(range(loops), "transitions", unit="loop", leave=False, disable=None)
-    runs = [_run(law, memory, plant, steps, (seed, 0, k)) for k in bar]
+    runs = [loop(law, (seed, 0, k)) for k in bar]
     parts = ([torch.from_numpy(x) for x in (run.y, run.u, run.known)] for run in runs)
     model = law.design.plant
     names = model.outputs, model.inputs, model.known
     return Log([Trajectory(*part) for part in parts], *names, model.units, model.dt)
-
-
-def _run(law: Law, memory: Memory, plant: Plant, steps: int, entropy: tuple[int, ...]) -> Run:
-    rng = np.random.default_rng(entropy)
-    seed = int(rng.integers(2**31))
-    return simulate(law, memory, plant.plant, steps, seed=seed, **plant.options(rng))
 
 
 def _checked(log: Log, plant: StateSpace) -> Log:
@@ -241,7 +236,7 @@ def _with_model(law: Law, model: Identified) -> Law:
 
 
 def _compare(
-    old: Law, new: Law, memory: Memory, plant: Plant, steps: int, pairs: int, seed: int
+    loop: Loop, old: Law, new: Law, pairs: int, seed: int
 ) -> tuple[PairedTest, list[tuple[float, float]]]:
     """Return the test of pairs of closed loops, and the costs of each.
 
@@ -249,10 +244,10 @@ def _compare(
     """
     test, costs = PairedTest(), []
     for k in tqdm(range(pairs), "comparison", unit="pair", leave=False, disable=None):
-        run = _run(old, memory, plant, steps, (seed, 1, k))
+        run = loop(old, (seed, 1, k))
         before = run.cost.sum()
         try:
-            after = _run(new, memory, plant, steps, (seed, 1, k)).costs(run.u_s).sum()
+            after = loop(new, (seed, 1, k)).costs(run.u_s).sum()
         except (QPError, SolverError):  # no plan, or outputs that overflow
             after = math.inf
         costs.append((before, after))

@@ -67,9 +67,11 @@ class RunGate:
         """
         if self._gate is None or (update != self._cfg.updates and update % self._interval):
             return {}
-        verdict = self._gate.judge(self._learner.actor)
-        names = ("accepted", "mean", "low", "high", "pairs")
-        return {f"gate/{name}": float(getattr(verdict, name)) for name in names}
+        test = self._gate.judge(self._learner.actor)
+        low, high = test.interval
+        scalars = {"accepted": test.decision == "better", "mean": test.mean, "low": low}
+        scalars |= {"high": high, "pairs": test.pairs}
+        return {f"gate/{name}": float(x) for name, x in scalars.items()}
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
         if self._cfg.gate == "plant":

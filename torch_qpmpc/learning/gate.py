@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -162,21 +161,6 @@ class _Bets:
         return high
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The outcome of a comparison: the candidate is ``accepted``, at an interval of ``mean``.
-
-    ``restarted`` is True if the candidate has become a copy of the policy that is kept.
-    """
-
-    accepted: bool
-    mean: float
-    low: float
-    high: float
-    pairs: int
-    restarted: bool = False
-
-
 class Gate:
     """Keeps the best policy so far, and replaces it by a candidate that is shown to cost less.
 
@@ -227,29 +211,26 @@ class Gate:
         return PairedTest(self._alpha * self._decisions / (k * (k + 1)), self._bound)
 
     @torch.no_grad()
-    def judge(self, candidate: nn.Module) -> Verdict:
+    def judge(self, candidate: nn.Module) -> PairedTest:
         """Compare ``candidate`` with the policy that is kept, on new starts and disturbances.
 
         Pairs are added until the test is decided, the candidate's mean cost is no lower, or there
-        are ``pairs``. An accepted candidate's parameters are copied to the policy that is kept;
-        after ``patience`` rejections in a row it is the other way round.
+        are ``pairs``. The parameters of a candidate that is better are copied to the policy that is
+        kept; after ``patience`` rejections in a row it is the other way round.
 
         Raises:
             QPError: ``costs`` returns another shape than ``(starts,)``.
         """
         test = self._compare(candidate)
-        accepted, restarted = test.decision == "better", False
-        self._in_a_row = 0 if accepted else self._in_a_row + 1
-        if accepted:
-            self.accepted += 1
+        if test.decision == "better":
+            self.accepted, self._in_a_row = self.accepted + 1, 0
             self.actor.load_state_dict(candidate.state_dict())
-        else:
-            self.rejected += 1
-            restarted = self._patience is not None and self._in_a_row >= self._patience
-            if restarted:
-                candidate.load_state_dict(self.actor.state_dict())
-                self._in_a_row = 0
-        return Verdict(accepted, test.mean, *test.interval, test.pairs, restarted)
+            return test
+        self.rejected, self._in_a_row = self.rejected + 1, self._in_a_row + 1
+        if self._in_a_row == self._patience:
+            candidate.load_state_dict(self.actor.state_dict())
+            self._in_a_row = 0
+        return test
 
     def _compare(self, candidate: nn.Module) -> PairedTest:
         test, count = self._test(), 0
