@@ -161,11 +161,8 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("C: got QPMPC, expected a floating-point torch.Tensor.", lambda: si(mpc, zeros(1, 11))),
     # Analysis
     ("C: got shape (11,), expected shape (*batch, N", lambda: prediction_form(zeros(11), 2, 1)),
-    ("form: got Parameter, expected a PredictionForm.", lambda: canonical_matrix(mpc.C, A2)),
-    (
-        "form.Phi: got shape (2, 6, 2), expected",
-        lambda: canonical_matrix(pair, zeros(3, 2, 2).double()),
-    ),
+    ("form: got Parameter, expected a PredictionForm.", lambda: canonical_matrix(mpc.C)),
+    ("form.Phi: got shape (2, 6, 2), expected", lambda: canonical_matrix(pair)),
     ("mpc: got Tensor, expected a QPMPC.", lambda: read(mpc.C_0)),
     ("true_model: got tuple of 1, expected the pair (A, B), (A, B,", lambda: read(mpc, (A2,))),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: structure_metrics(op)),

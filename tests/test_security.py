@@ -21,7 +21,7 @@ from tests.runs import SMALL, make_config, run_command
 from torch_qpmpc import QPMPC, QPError, export_c, load_run
 from torch_qpmpc.experiment.config import flatten
 from torch_qpmpc.experiment.start import stored_log
-from torch_qpmpc.files import labelled, load_file, write_whole
+from torch_qpmpc.files import VERSION, load_file, write_whole
 from torch_qpmpc.mpc.state import KIND
 from torch_qpmpc.study.report import main as report
 
@@ -165,7 +165,7 @@ class Payload:
 @pytest.mark.parametrize("name", ["checkpoint.pt", "best.pt", "log.pt", "mine.qpmpc"])
 def test_pickles_run_no_code(folder, mark, name):
     content = {"action": torch.zeros(3, 1), "mpc": Payload(mark)}
-    torch.save(labelled("QPMPC", content), folder / name)
+    torch.save({"kind": "QPMPC", "version": VERSION, **content}, folder / name)
     read: dict[str, Callable[[Path], Any]] = {
         "checkpoint.pt": resume,
         "best.pt": COMMANDS["learned"],

@@ -44,15 +44,10 @@ def read_tensors(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def labelled(kind: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``content`` with the entries that `load_file` compares."""
-    return {"kind": kind, "version": VERSION, **content}
-
-
 def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write ``content``, tensors and plain values by name, as a file of a ``kind``."""
     buffer = io.BytesIO()
-    torch.save(labelled(kind, content), buffer)
+    torch.save({"kind": kind, "version": VERSION, **content}, buffer)
     write_whole(Path(path), buffer.getbuffer())
 
 

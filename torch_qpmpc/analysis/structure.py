@@ -137,21 +137,16 @@ def predictions(mpc: QPMPC) -> PredictionForm:
 
 def canonical(mpc: QPMPC) -> Tensor:
     """Return C ``(n_c, n_z)`` in the gauge that makes an MPC scheme's C banded."""
-    form = predictions(mpc)
-    return canonical_matrix(form, stage_models(form).A)[0]
+    return canonical_matrix(predictions(mpc))[0]
 
 
-def canonical_matrix(form: PredictionForm, A: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``.
+def canonical_matrix(form: PredictionForm) -> tuple[Tensor, Tensor]:
+    """Return the same constraints with row blocks ``A_k x_k + .. - x_{k+1}``, by `stage_models`.
 
     For an MPC scheme the result is the banded C_0; otherwise entries off the band are what x_k, u_k
-    and d_k do not explain. A is ``(N, n_x, n_x)``, such as ``stage_models(form).A``; the result is
-    C ``(N n_x, n_z)`` and b ``(N n_x,)``.
+    and d_k do not explain. It is C ``(N n_x, n_z)`` and b ``(N n_x,)``.
     """
-    _check_form(form)
-    n_x, N = form.layout.n_x, form.layout.horizon
-    check_tensor("A", A, N, n_x, n_x, batched=False, remedy="Pass stage_models(form).A.")
-    A = A.to(form.Phi)
+    A, n_x, N = stage_models(form).A, form.layout.n_x, form.layout.horizon
     F = form.Phi.new_zeros(N * n_x, form.layout.n_z)
     following, p, u = _columns(form.layout)
     F[:, p], F[:, u] = form.Phi, form.Gamma

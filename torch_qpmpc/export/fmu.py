@@ -15,10 +15,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from torch_qpmpc.export.export import Export, export_c
+from torch_qpmpc.export.export import Export, build
 from torch_qpmpc.export.library import FLAGS, built, required_compiler
 from torch_qpmpc.export.tables import make_tables
-from torch_qpmpc.export.writer import filled
+from torch_qpmpc.export.writer import Settings, filled
 from torch_qpmpc.mpc.module import QPMPC
 
 #: The values of the variable ``status``: the codes of C, in their order.
@@ -88,9 +88,7 @@ def export_fmu(
         Variable("u.lower", "constant", tables.u_lower, "bounds of u"),
         Variable("u.upper", "constant", tables.u_upper, "bounds of u"),
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        report = export_c(mpc, folder, name=name, max_iterations=max_iterations, storage=storage)
-        texts = {file.name: file.read_text(encoding="utf-8") for file in report.files}
+    report, texts, _ = build(mpc, Settings(name, "float64", storage, max_iterations))
     return replace(report, files=(write_fmu(path, name, texts, variables),))
 
 
