@@ -105,7 +105,7 @@ SHORT = {
     "python train.py -m task.file=docs/examples/short_horizon.py weighted=true eval_seed=777 "
     "seed=range(111,121)": Short(SWEEP),
     "python -m torch_qpmpc.report runs/study-paper": Short(),
-    "python -m torch_qpmpc.report runs/study-paper --page docs/results/paper.md": Short(),
+    "python -m tests.benchmarks.paper runs/study-paper": Short(),
     "python -m torch_qpmpc.report runs/study-frontier": Short(),
     # A script of one's own.
     "python train.py task.file=my_task.py solver=daqp hydra.run.dir=pole": Short(

@@ -19,12 +19,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from tests.benchmarks.table import PAGE, significant
+from tests.benchmarks.table import PAGE, significant, write_section
 from tests.campaign.exports import PROBLEMS
 from torch_qpmpc import QPMPC, CompiledPolicy, export_c
 from torch_qpmpc.export.comparison import actions, reference
 from torch_qpmpc.export.library import required_compiler
-from torch_qpmpc.study.markdown import write_section
 
 HERE = Path(__file__).parent
 CHOSEN = ("point mass, N = 10", "12 states, 4 actions, N = 10")

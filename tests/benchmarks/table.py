@@ -8,7 +8,8 @@ from typing import Any
 
 import pandas as pd
 
-from torch_qpmpc.study.markdown import table, write_section
+from torch_qpmpc.errors import QPError
+from torch_qpmpc.study.markdown import table
 
 __all__ = ["DOCS", "PAGE", "ROOT", "keep", "options_of", "publish", "significant", "table"]
 __all__ += ["write_section"]
@@ -62,3 +63,15 @@ def keep(
             rows.to_csv(path, index=False, float_format="%.6g", na_rep=na_rep)
             print(*row.values(), flush=True)
     return rows
+
+
+def write_section(page: Path, new: str, marker: str) -> None:
+    """Replace what ``page`` has between ``<!-- marker -->`` and ``<!-- /marker -->`` by ``new``."""
+    text = page.read_text(encoding="utf-8")
+    begin, end = f"<!-- {marker} -->", f"<!-- /{marker} -->"
+    counts = text.count(begin), text.count(end)
+    if counts != (1, 1) or text.index(begin) > text.index(end):
+        expected = f"one line {begin} and below it one line {end}"
+        raise QPError.expected(str(page), f"{counts[0]} and {counts[1]}", expected, "Add them.")
+    before, after = text.split(begin)[0], text.split(end)[1]
+    page.write_text(f"{before}{begin}\n\n{new}\n\n{end}{after}", encoding="utf-8")

@@ -1,7 +1,7 @@
 import pytest
 
+from tests.benchmarks.table import table, write_section
 from torch_qpmpc import QPError
-from torch_qpmpc.study.markdown import table, write_section
 
 
 def test_a_table_has_its_numbers_to_the_right():

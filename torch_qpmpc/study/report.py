@@ -22,7 +22,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.evaluation import cost_text
 from torch_qpmpc.files import write_whole
 from torch_qpmpc.study import plots
-from torch_qpmpc.study.markdown import escaped, table, write_section
+from torch_qpmpc.study.markdown import escaped, table
 from torch_qpmpc.study.runs import CASES, REAL_GAP, collect
 from torch_qpmpc.study.statistics import interquartile_mean, spread
 
@@ -110,27 +110,12 @@ def write(frame: pd.DataFrame, folder: Path) -> str:
     return "\n\n".join(page for page in pages if not page.startswith("!["))
 
 
-def write_page(frame: pd.DataFrame, page: Path, name: str) -> None:
-    """Write the tables between the markers ``name`` of a Markdown file, and NAME.png beside it."""
-    sweeps = frame.groupby("sweep")
-    tables = [f"**{escaped(title)}**\n\n{section(sweep)}" for title, sweep in sweeps]
-    write_section(page, "\n\n".join(tables), name)
-    _, first = max(sweeps, key=lambda pair: pair[1]["closed_gap"].median())
-    if len({*first["label"]}) <= SIDE_BY_SIDE:
-        plots.meaning_figure(first).savefig(page.with_name(f"{name}.png"), dpi=90)
-
-
 def main(arguments: list[str] | None = None) -> None:
     about = "Write tables and figures of finished runs."
     parser = argparse.ArgumentParser(prog="python -m torch_qpmpc.report", description=about)
     parser.add_argument("folder", type=Path, metavar="RUNS_FOLDER", help="runs at any depth")
-    page = "Markdown file whose <!-- RUNS_FOLDER --> section gets the tables"
-    parser.add_argument("--page", type=Path, help=page)
-    options = parser.parse_args(arguments)
+    folder = parser.parse_args(arguments).folder
     try:
-        frame = collect(options.folder)
-        if options.page:
-            write_page(frame, options.page, options.folder.resolve().name)
-        print(f"{write(frame, options.folder / 'report')}\n\n{options.folder / 'report'}")
+        print(f"{write(collect(folder), folder / 'report')}\n\n{folder / 'report'}")
     except QPError as error:
         raise SystemExit(str(error)) from None
