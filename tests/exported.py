@@ -15,7 +15,7 @@ from torch_qpmpc import QPMPC, QuadraticProgram
 from torch_qpmpc.export.export import AT_LEAST, PER_ROW
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import Tables, make_tables
-from torch_qpmpc.export.writer import Example, Examples, Settings, sources
+from torch_qpmpc.export.writer import Examples, Settings, sources
 
 DRIVER = Path(__file__).parent / "export" / "driver.c"
 STRICT = ("-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-pedantic")
@@ -148,8 +148,8 @@ def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.rows) + AT_LEAST
     chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
-    origin = Example("origin", np.zeros(tables.n_p), 0, np.zeros(tables.n_u), 0.0, 0.0, 0.0)
-    nothing = Examples([origin], np.zeros(tables.n_u))
+    p, u, none = np.zeros((1, tables.n_p)), np.zeros((1, tables.n_u)), np.zeros(1)
+    nothing = Examples(["origin"], p, np.zeros(1, int), u, none, none, none, u[0])
     texts, flags = sources(tables, chosen, "", nothing), (*flags, "-std=c99", "-fPIC", "-shared")
     return Library(texts, "policy", chosen.dtype, flags), tables
 

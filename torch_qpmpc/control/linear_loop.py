@@ -18,8 +18,8 @@ from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.export.tables import make_tables
 
-#: Frequencies, from SLOWEST to alternating samples.
-FREQUENCIES, SLOWEST = 400, 1e-4
+#: Frequencies, from SLOWEST to alternating samples; doublings of the time until noise settles.
+FREQUENCIES, SLOWEST, DOUBLINGS = 400, 1e-4, 50
 
 
 @dataclass(frozen=True, eq=False)

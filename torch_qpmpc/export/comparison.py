@@ -14,7 +14,7 @@ import torch
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.export.library import Library
 from torch_qpmpc.export.tables import TINY, Array, Tables, far
-from torch_qpmpc.export.writer import CONSTANTS, NEAR, Example, Examples
+from torch_qpmpc.export.writer import CONSTANTS, NEAR, Examples
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -204,13 +204,10 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
     u, value = actions(mpc, exact), np.where(solved, exact.value, 0.0)
     forces = (np.abs(exact.lam) * (np.abs(exact.z) @ G.T)).sum(-1)  # what an error of a row costs
     size = np.fmax(np.fmax(np.abs(value), _size(value, solved)), np.where(solved, forces, 0.0))
-    values = np.stack((value, size, terms), -1).tolist()
-    examples = [
-        Example(kind, p[i], 0 if solved[i] else INFEASIBLE, u[i], *values[i])
-        for kind, indices in chosen.items()
-        for i in indices
-    ]
-    return Examples(examples, _size(u, solved)), exact
+    names = [kind for kind, indices in chosen.items() for _ in indices]
+    parts = p, np.where(solved, 0, INFEASIBLE), u, value, size, terms
+    at = np.concatenate([*chosen.values()])
+    return Examples(names, *(part[at] for part in parts), _size(u, solved)), exact
 
 
 def _size(x: Array, solved: Array) -> Array:

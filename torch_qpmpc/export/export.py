@@ -148,7 +148,7 @@ def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Libra
         if not error <= NEAR[dtype].u:
             refuse(dtype, f"an action off by {error:.1e} of its size", tables)
         if failed := library.selftest():
-            kinds = [*(example.kind for example in examples.states), "invalid"]
+            kinds = [*examples.kinds, "invalid"]
             refuse(dtype, f"a failed self-test at state {failed} ({kinds[failed - 1]})", tables)
     elif dtype == "float32":
         remedy = "Install one, or export float64."

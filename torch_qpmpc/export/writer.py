@@ -48,23 +48,21 @@ ROUNDING = 64
 WIDTH = 100
 
 
-class Example(NamedTuple):
-    """A state of the self-test: p, and the expected code, u and value, of a size and of terms."""
-
-    kind: str
-    p: Array
-    code: int
-    u: Array
-    value: float
-    size: float
-    terms: float
-
-
 class Examples(NamedTuple):
-    """The states of the self-test, and the sizes of actions there, ``(n_u,)``."""
+    """The S states of the self-test: their kinds, p ``(S, n_p)`` and the expected results there.
 
-    states: Sequence[Example]
+    These are codes, u ``(S, n_u)`` and values, the latter with sizes and terms that they are judged
+    by, ``(S,)`` each, and the sizes of actions ``(n_u,)``.
+    """
+
+    kinds: Sequence[str]
+    p: Array
+    codes: Array
     u: Array
+    values: Array
+    sizes: Array
+    terms: Array
+    of_u: Array
 
 
 class Settings(NamedTuple):
@@ -87,7 +85,7 @@ def sources(tables: Tables, settings: Settings, header: str, examples: Examples)
         ),
         "/* @TABLES@ */": _tables(tables, settings),
         "/* @LEVELS@ */": filled("levels.c", settings.name) if tables.levels else "",
-        "/* @EXAMPLES@ */": _examples(tables, settings, examples),
+        "/* @EXAMPLES@ */": _examples(settings, examples),
     }
     return {f"{settings.name}.{end}": filled(f"policy.{end}", settings.name, parts) for end in "hc"}
 
@@ -243,22 +241,22 @@ def number(x: float, dtype: str) -> str:
     return f"{text if {'.', 'e'} & {*text} else f'{text}.0'}f"
 
 
-def _examples(tables: Tables, settings: Settings, examples: Examples) -> str:
+def _examples(settings: Settings, examples: Examples) -> str:
     """Return the tables of the self-test, with tolerances relative to the sizes."""
-    dtype, near, states = settings.dtype, NEAR[settings.dtype], examples.states
+    dtype, near = settings.dtype, NEAR[settings.dtype]
+    rounding = ROUNDING * np.finfo(dtype).eps * examples.terms
     arrays = {
-        "EXAMPLE_P": np.array([e.p for e in states]).reshape(-1, tables.n_p),
-        "EXAMPLE_U": np.array([e.u for e in states]).reshape(-1, tables.n_u),
-        "EXAMPLE_VALUE": np.array([e.value for e in states]),
-        "NEAR_U": near.u * examples.u,
-        "NEAR_VALUE": near.value * np.array([e.size for e in states])
-        + ROUNDING * np.finfo(dtype).eps * np.array([e.terms for e in states]),
+        "EXAMPLE_P": examples.p,
+        "EXAMPLE_U": examples.u,
+        "EXAMPLE_VALUE": examples.values,
+        "NEAR_U": near.u * examples.of_u,
+        "NEAR_VALUE": near.value * examples.sizes + rounding,
     }
     return "\n".join(
         [
-            f"/* States of the self-test: {', '.join(e.kind for e in states)}. */",
-            f"#define EXAMPLES {len(states)}",
-            f"static const int EXAMPLE_CODE[] = {{{', '.join(str(e.code) for e in states)}}};",
+            f"/* States of the self-test: {', '.join(examples.kinds)}. */",
+            f"#define EXAMPLES {len(examples.kinds)}",
+            integers("EXAMPLE_CODE", examples.codes),
             *(array(name, x, dtype) for name, x in arrays.items()),
         ]
     )
