@@ -146,7 +146,7 @@ def draw_known(mpc: Any, count: int, seed: int = 0) -> np.ndarray:
 def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[Library, Tables]:
     """Compile the tables of a QP, without a comparison."""
     tables = make_tables(mpc)
-    limit = PER_ROW * len(tables.rows) + AT_LEAST
+    limit = PER_ROW * len(tables.Q) + AT_LEAST
     chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
     p, u, none = np.zeros((1, tables.n_p)), np.zeros((1, tables.n_u)), np.zeros(1)
     nothing = Examples(["origin"], p, np.zeros(1, int), u, none, none, none, u[0])

@@ -171,7 +171,7 @@ def test_the_limit_of_iterations_is_reported_and_the_next_step_continues(tmp_pat
 def test_a_qp_without_rows_has_a_linear_policy():
     mpc = drawn_mpc(2, 1, 3, stage_weight=[1.0, 1.0, 0.1])
     library, tables = load(mpc, flags=("-O2", *STRICT))
-    assert len(tables.rows) == 0
+    assert len(tables.Q) == 0
     p = draw_known(mpc, 50)
     steps = library.steps(library.states(50), p, 1)
     assert not steps.codes.any()

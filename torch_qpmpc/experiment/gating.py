@@ -68,10 +68,9 @@ class RunGate:
         if self._gate is None or (update != self._cfg.updates and update % self._interval):
             return {}
         test = self._gate.judge(self._learner.actor)
-        low, high = test.interval
-        scalars = {"accepted": test.decision == "better", "mean": test.mean, "low": low}
-        scalars |= {"high": high, "pairs": test.pairs}
-        return {f"gate/{name}": float(x) for name, x in scalars.items()}
+        names = ("accepted", "mean", "low", "high", "pairs")
+        values = test.decision == "better", test.mean, *test.interval, test.pairs
+        return {f"gate/{name}": float(x) for name, x in zip(names, values, strict=True)}
 
     def _costs(self, actor: Any, seed: int) -> Tensor:
         if self._cfg.gate == "plant":

@@ -109,7 +109,7 @@ def states(mpc: QPMPC, tables: Tables, dtype: str) -> tuple[Array, BatchSolution
     Of four infeasible ones three are halved in their distance to the centre until they have one:
     the p with a plan are a convex set.
     """
-    count = int(COMPARED * min(1.0, LARGE / max(len(tables.rows), 1)) ** 2) * (not mpc.levels)
+    count = int(COMPARED * min(1.0, LARGE / max(len(tables.Q), 1)) ** 2) * (not mpc.levels)
     away = draw(tables, max(count, min(LEAST, COMPARED))) - tables.centre
     few, halved = np.arange(len(away)) % 4 > 0, np.zeros(len(away))
     halved[few] = np.ceil(-np.log2(reaches(tables, away[few])))
@@ -132,8 +132,7 @@ def draw(tables: Tables, count: int, seed: int = 0) -> Array:
     hard rows with equal bounds.
     """
     rng = np.random.default_rng(seed)
-    pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
-    Y, lower, upper, *_ = (np.concatenate(pair) for pair in pairs)
+    Y, lower, upper, *_ = map(np.concatenate, zip(tables.rows, tables.known, strict=True))
     reach = np.abs(np.stack((lower, upper))) / np.abs(Y).max(1, initial=TINY)
     acts = ~far(reach, np.isfinite(reach) & (reach > 0))
     span = np.where(np.isfinite(reach).all(0) & acts.all(0), upper - lower, 0.0)
@@ -162,9 +161,8 @@ def reaches(tables: Tables, away: Array) -> Array:
 
     It is 1, too, where a linear program is not solved.
     """
-    pairs = zip(tables.rows.parts(), tables.known.parts(), strict=True)
-    Y, lower, upper, w, *_ = map(np.concatenate, pairs)
-    at, R = Y @ tables.centre, np.pad(tables.R, ((0, len(tables.known)), (0, 0)))
+    Y, lower, upper, w, *_ = map(np.concatenate, zip(tables.rows, tables.known, strict=True))
+    at, R = Y @ tables.centre, np.pad(tables.R, ((0, len(tables.known.Y)), (0, 0)))
     room, Y, R = np.append(upper - at, at - lower), np.vstack((Y, -Y)), np.vstack((R, -R))
     acts = np.isfinite(room) & np.tile(np.isinf(w), 2)
     if not acts.any():
@@ -207,7 +205,7 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
     names = [kind for kind, indices in chosen.items() for _ in indices]
     parts = p, np.where(solved, 0, INFEASIBLE), u, value, size, terms
     at = np.concatenate([*chosen.values()])
-    return Examples(names, *(part[at] for part in parts), _size(u, solved)), exact
+    return Examples._make((names, *(part[at] for part in parts), _size(u, solved))), exact
 
 
 def _size(x: Array, solved: Array) -> Array:
@@ -250,7 +248,7 @@ def compare(
     )
     errors = np.where(both, u / sizes, 0)
     for i in np.flatnonzero(errors > NEAR[str(library.real)].u):
-        lam = library.multipliers(states, len(tables.rows))[i]
+        lam = library.multipliers(states, len(tables.Q))[i]
         if u[i] <= _tolerance(tables, str(library.real), p[i], lam):
             errors[i] = 0
     return agreement, float(errors.max(initial=0))

@@ -130,7 +130,7 @@ def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Libra
     name, dtype, storage, limit = settings
     _check(mpc, settings)
     tables = make_tables(mpc)
-    settings = settings._replace(max_iterations=limit or PER_ROW * len(tables.rows) + AT_LEAST)
+    settings = settings._replace(max_iterations=limit or PER_ROW * len(tables.Q) + AT_LEAST)
     p, exact = states(mpc, tables, dtype)
     examples, exact = choose(mpc, p, exact)
     texts = sources(tables, settings, header(mpc, tables, settings), examples)
@@ -155,7 +155,7 @@ def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Libra
         raise QPError.expected("dtype", "'float32' without a C compiler to test it", "one", remedy)
     own = "some" if library is None else str(library.state_bytes)
     texts = {file: text.replace("@BYTES@", own) for file, text in texts.items()}
-    sizes = {"n_p": tables.n_p, "n_u": tables.n_u, "rows": len(tables.rows)}
+    sizes = {"n_p": tables.n_p, "n_u": tables.n_u, "rows": len(tables.Q)}
     sizes |= {"variables": tables.R.shape[1], "table_bytes": table_bytes(tables, settings)}
     export = Export(
         files=(),

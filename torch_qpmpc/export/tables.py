@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,8 +38,7 @@ FAR = 1e6
 Array = np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(NamedTuple):
     """Rows ``lower <= Y p + .. <= upper`` with weights w; the offset of y is in the bounds.
 
     Attributes:
@@ -54,13 +54,6 @@ class Rows:
     w: Array
     size: Array
     unit: Array
-
-    def __len__(self) -> int:
-        return len(self.Y)
-
-    def parts(self) -> tuple[Array, ...]:
-        """Return all six arrays."""
-        return self.Y, self.lower, self.upper, self.w, self.size, self.unit
 
 
 @dataclass(frozen=True, eq=False)

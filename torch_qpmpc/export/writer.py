@@ -149,10 +149,10 @@ def factored(tables: Tables, settings: Settings) -> bool:
 
 def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
     """Return the sizes in the header, by the macro's name without the prefix."""
-    r, d, most = len(tables.rows), tables.R.shape[1], held(tables)
+    r, d, most = len(tables.Q), tables.R.shape[1], held(tables)
     small = factored(tables, settings)
     sizes = {"N_P": tables.n_p, "N_U": tables.n_u, "ROWS": r, "ROWS_": max(r, 1)}
-    sizes |= {"KNOWN": len(tables.known), "D": d, "HELD": most, "HELD_": max(most, 1)}
+    sizes |= {"KNOWN": len(tables.known.Y), "D": d, "HELD": most, "HELD_": max(most, 1)}
     sizes |= {"TRIANGLE": max(most * (most + 1) // 2, 1), "FACTORED": int(small)}
     sizes |= {"WORK": d * small, "LEVELS": 0}
     if levels := tables.levels:

@@ -58,7 +58,7 @@ def encode(program: Program, tables: Tables, p: Affine, vertices: Array) -> Affi
     # HiGHS' tolerances are absolute, so y and lam are in units of the largest y.
     size = np.abs(vertices @ tables.rows.Y.T).max(initial=0.0) or 1.0
     units = {name: getattr(tables.rows, name) / size for name in ("Y", "lower", "upper", "w")}
-    tables = replace(tables, rows=replace(tables.rows, **units), F=size * tables.F)
+    tables = replace(tables, rows=tables.rows._replace(**units), F=size * tables.F)
     reach = _derived(tables, vertices)
     for _ in range(ROUNDS):
         _tighten(program, tables, p, reach)
@@ -145,7 +145,7 @@ def _tighten(program: Program, tables: Tables, p: Affine, reach: Reach) -> None:
         bound = relaxed.maximise(of.part([i]).times(sign * np.eye(1)), relaxed=True).bound
         return bound + MARGIN * (1 + abs(bound))
 
-    for i in range(len(rows)):
+    for i in range(len(rows.Y)):
         if reach.y_high[i] > rows.upper[i]:
             reach.y_high[i] = min(reach.y_high[i], most(y, i, 1.0))
             reach.at_upper[i] = min(reach.at_upper[i], max(most(up, i, 1.0), 0.0))
@@ -163,7 +163,7 @@ def _add_rows(
         lam, and of it y and the multipliers at upper and at lower bounds.
     """
     rows = tables.rows
-    r, hard = len(rows), np.isinf(rows.w)
+    r, hard = len(rows.Y), np.isinf(rows.w)
     equal = hard & (rows.lower == rows.upper)
     possible = reach.y_high > rows.upper, reach.y_low < rows.lower
     up = program.add(np.zeros(r), np.where(possible[0] | equal, reach.at_upper, 0.0))

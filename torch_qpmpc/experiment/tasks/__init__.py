@@ -12,7 +12,6 @@ from typing import Any
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import TASKS, Config, TaskSettings, find_task
 from torch_qpmpc.experiment.tasks import gros_zanon, gymnasium, point_mass  # noqa: F401 (register)
-from torch_qpmpc.experiment.tasks.code import run_code
 from torch_qpmpc.experiment.tasks.identified import Start, identified_scheme
 from torch_qpmpc.experiment.tasks.registry import (
     AnyPlant,
@@ -38,7 +37,6 @@ __all__ = [
     "plant_scheme",
     "priced",
     "register",
-    "run_code",
 ]
 
 
