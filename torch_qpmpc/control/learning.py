@@ -111,13 +111,13 @@ def learn(
         middle = law.read_set_points(r, 1, memory.r)[0]
         size, name = _sizes(law.design, spread, SMALL * law.design.usual), "the environment"
 
-        def loop(law: Law, entropy: tuple[int, ...]) -> Run:
+        def run(law: Law, entropy: tuple[int, ...]) -> Run:
             rng = np.random.default_rng(entropy)
             options = {"seed": int(rng.integers(2**31)), "known": known}
             levels = _levels(law.design, middle, size, steps, rng)
             return simulate(law, memory, source, steps, levels, **options)
 
-        log = _gathered(loop, law, -(-transitions // steps), seed)
+        loop, log = run, _gathered(run, law, -(-transitions // steps), seed)
     elif known is not None:
         raise QPError.expected("known", "signals beside a log", "None: the log has its own")
     else:

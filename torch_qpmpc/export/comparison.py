@@ -247,7 +247,7 @@ def compare(
         iterations=int(steps.iterations.max(initial=0)),
     )
     errors = np.where(both, u / sizes, 0)
-    for i in np.flatnonzero(errors > NEAR[str(library.real)].u):
+    for i in np.flatnonzero(errors > NEAR[str(library.real)]):
         lam = library.multipliers(states, len(tables.Q))[i]
         if u[i] <= _tolerance(tables, str(library.real), p[i], lam):
             errors[i] = 0

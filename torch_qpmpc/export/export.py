@@ -145,7 +145,7 @@ def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Libra
             got = f"{limit}, with none of {solvable} states solved"
             remedy = "Raise it, or leave it out."
             raise QPError.expected("max_iterations", got, "a limit that solves some", remedy)
-        if not error <= NEAR[dtype].u:
+        if not error <= NEAR[dtype]:
             refuse(dtype, f"an action off by {error:.1e} of its size", tables)
         if failed := library.selftest():
             kinds = [*examples.kinds, "invalid"]

@@ -16,14 +16,6 @@ import numpy as np
 from torch_qpmpc.export.tables import Array, Tables
 from torch_qpmpc.mpc.module import QPMPC
 
-
-class Near(NamedTuple):
-    """Tolerances of the self-test."""
-
-    u: float
-    value: float
-
-
 _CONSTANTS = {
     "BIG": ("1e300", "1e30f"),
     "TOLERANCE": ("1e-11", "4e-6f"),
@@ -42,7 +34,7 @@ REAL = {"float64": "double", "float32": "float"}
 #: Tolerances by dtype, of which `torch_qpmpc/export/policy.c` explains the use.
 CONSTANTS = {x: {key: pair[i] for key, pair in _CONSTANTS.items()} for i, x in enumerate(REAL)}
 #: Largest differences in the self-test, relative to the largest expected action and value.
-NEAR = {"float64": Near(1e-6, 1e-8), "float32": Near(1e-3, 1e-4)}
+NEAR, NEAR_VALUE = {"float64": 1e-6, "float32": 1e-3}, {"float64": 1e-8, "float32": 1e-4}
 #: The rounding of a value, in units in the last place of its terms, which may cancel.
 ROUNDING = 64
 WIDTH = 100
@@ -137,11 +129,6 @@ def _harmless(line: str) -> str:
     return line
 
 
-def held(tables: Tables) -> int:
-    """Return the most rows that can be held at once."""
-    return min(tables.R.shape)
-
-
 def factored(tables: Tables, settings: Settings) -> bool:
     """Return True if R is stored in place of Q."""
     return settings.storage == "small" and tables.R.shape[1] < tables.R.shape[0]
@@ -149,7 +136,8 @@ def factored(tables: Tables, settings: Settings) -> bool:
 
 def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
     """Return the sizes in the header, by the macro's name without the prefix."""
-    r, d, most = len(tables.Q), tables.R.shape[1], held(tables)
+    r, d = tables.R.shape
+    most = min(r, d)  # rows that are held at once
     small = factored(tables, settings)
     sizes = {"N_P": tables.n_p, "N_U": tables.n_u, "ROWS": r, "ROWS_": max(r, 1)}
     sizes |= {"KNOWN": len(tables.known.Y), "D": d, "HELD": most, "HELD_": max(most, 1)}
@@ -243,14 +231,14 @@ def number(x: float, dtype: str) -> str:
 
 def _examples(settings: Settings, examples: Examples) -> str:
     """Return the tables of the self-test, with tolerances relative to the sizes."""
-    dtype, near = settings.dtype, NEAR[settings.dtype]
+    dtype = settings.dtype
     rounding = ROUNDING * np.finfo(dtype).eps * examples.terms
     arrays = {
         "EXAMPLE_P": examples.p,
         "EXAMPLE_U": examples.u,
         "EXAMPLE_VALUE": examples.values,
-        "NEAR_U": near.u * examples.of_u,
-        "NEAR_VALUE": near.value * examples.sizes + rounding,
+        "NEAR_U": NEAR[dtype] * examples.of_u,
+        "NEAR_VALUE": NEAR_VALUE[dtype] * examples.sizes + rounding,
     }
     return "\n".join(
         [
