@@ -50,7 +50,7 @@ from torch_qpmpc.experiment.metrics import (
     table,
     update_metrics,
 )
-from torch_qpmpc.experiment.run_folder import CHECKPOINT, RunFolder, not_null
+from torch_qpmpc.experiment.run_folder import BEST, CHECKPOINT, RunFolder, not_null
 from torch_qpmpc.experiment.run_state import RunState
 from torch_qpmpc.experiment.start import make_start, read_observer, transitions
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
@@ -101,7 +101,7 @@ def train(
     replay = make_run_replay(cfg, mpc)
     gate = RunGate(cfg, learner, physics)
     if mpc is not first:
-        gate.keep(first)
+        gate.mpc.load_state_dict(first.state_dict())
 
     # The data: vectorised episodes under the current policy, which the replay stores.
     collector = make_collector(cfg, physics, gate.acting)
@@ -124,7 +124,7 @@ def train(
                 # Its constant is from the log: what random actions cost.
                 run.log({"train/centred": learner.centre(replay)}, 0)
                 if mpc is first:
-                    gate.keep(mpc)
+                    gate.mpc.load_state_dict(mpc.state_dict())
         else:
             parts.restore(state)
             if state["collector"] is None and tally.update < cfg.updates and not quiet:
@@ -173,9 +173,9 @@ def train(
                 progress.set_postfix(shown)
                 run.flush()
                 save_file(run.path / CHECKPOINT, KIND, parts.snapshot())
-                gate.save(run.path)
+                gate.mpc.save(run.path / BEST)
 
-        gate.save(run.path)
+        gate.mpc.save(run.path / BEST)
         if cfg.figures:
             draw_outcome(run, gate.mpc, evaluation)
         if cfg.gate and not judged.get("gate/accepted"):

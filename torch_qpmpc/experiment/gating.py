@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from torch import Tensor
 
 from torch_qpmpc.experiment.algorithms import Learner, evaluate
 from torch_qpmpc.experiment.config import Config
-from torch_qpmpc.experiment.run_folder import BEST
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.learning.gate import Gate
 from torch_qpmpc.learning.operators import warm_policy
@@ -79,20 +77,12 @@ class RunGate:
         self.compared += costs.numel()
         return costs.sum(0)
 
-    def keep(self, mpc: QPMPC) -> None:
-        """Keep the policy of a QP, until a candidate costs less."""
-        self.mpc.load_state_dict(mpc.state_dict())
-
     def summary(self) -> dict[str, int]:
         """Return the numbers of candidates accepted and rejected, and of transitions for them."""
         if self._gate is None:
             return {}
         decisions = {"accepted": self._gate.accepted, "rejected": self._gate.rejected}
         return decisions | {COMPARED[self._cfg.gate == "plant"]: self.compared}
-
-    def save(self, folder: Path) -> None:
-        """Write the policy that is kept to best.pt."""
-        self.mpc.save(folder / BEST)
 
     def state_dict(self) -> dict[str, Any] | None:
         """Return the state of the gate; None without one."""
