@@ -144,7 +144,7 @@ def test_blocks_leave_fewer_variables_and_rows():
     free, held = (make_tables(blocked(blocks)) for blocks in ([], [1, 3]))
     assert (free.R.shape[1], held.R.shape[1]) == (4, 2)
     # Bounds and a row of D for each of two stages.
-    assert len(free.rows) - len(held.rows) == 4
+    assert len(free.Q) - len(held.Q) == 4
 
 
 def test_residuals_and_copies_keep_blocks(tmp_path):

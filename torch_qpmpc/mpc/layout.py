@@ -82,11 +82,6 @@ class Layout:
         """Entries of z, known and planned."""
         return self.n_p + self.horizon * self.n
 
-    @cached_property
-    def n_linear(self) -> int:
-        """Rows of D and D^f in G."""
-        return self.horizon * self.n_mixed + self.n_terminal
-
     def stages(self, x: Tensor, u: Tensor) -> Tensor:
         """Arrange x ``(N + 1, n_x)`` and u ``(N + 1, n_u)`` as [x_0, u_0, .., x_N], without u_N."""
         x, u = (part.expand(self.horizon + 1, -1) for part in (x, u))
@@ -224,12 +219,6 @@ def banded_matrix(A: Tensor, B: Tensor, horizon: int, E: Tensor | None = None) -
         return C
     preview = F.pad(torch.block_diag(*E.expand(horizon, n_x, n_d)), (0, n_d))
     return torch.cat((preview, C), dim=-1)
-
-
-def model_of(C: Tensor, layout: Layout) -> tuple[Tensor, ...]:
-    """Return A and B and, with a preview, E from the band of C, each with a leading N."""
-    E, A, B = layout.stage_blocks(C).split((layout.n_d, layout.n_x, layout.n_u), dim=-1)
-    return (A, B, E) if layout.n_d else (A, B)
 
 
 def band_distance(layout: Layout) -> Tensor:

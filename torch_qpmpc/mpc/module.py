@@ -157,7 +157,7 @@ class QPMPC(nn.Module):
         check_step(step)
         if dynamics is not None and learn is LEARN:
             learn = tuple(x for x in LEARN if x != "C")
-        check_learn(learn, structure, scheme.layout.n_linear)
+        check_learn(learn, structure, scheme.layout)
         backend(solver)
         self.scheme, self.layout = scheme, scheme.layout
         self.n_x, self.n_u, self.horizon = self.layout.n_x, self.layout.n_u, self.layout.horizon
@@ -564,11 +564,6 @@ class QPMPC(nn.Module):
     def extra_repr(self) -> str:
         names = ["n_x", "n_u", "horizon", *["n_d"] * bool(self.n_d), "hessian", "structure"]
         return ", ".join(f"{x}={getattr(self, x)!r}" for x in (*names, "learned", "solver"))
-
-    @property
-    def constants(self) -> dict[int, float]:
-        """The entries of p that have one value only, such as a 1 in the state."""
-        return {**self.scheme.constants}
 
     @property
     def arguments(self) -> dict[str, Any]:

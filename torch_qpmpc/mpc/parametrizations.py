@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.layout import Layout, banded_matrix, model_of
+from torch_qpmpc.mpc.layout import Layout, banded_matrix
 from torch_qpmpc.mpc.projections import CHOLESKY
 
 #: The parts of theta whose sign a convex QP constrains.
@@ -198,7 +198,9 @@ class Banded(nn.Module):
 
     def right_inverse(self, C: Tensor) -> tuple[Tensor, ...]:
         """Return the model in the band of C; raise `QPError` if C has other entries."""
-        model = tuple(part[0].contiguous() for part in model_of(C, self.layout))
+        sizes = self.layout.n_d, self.layout.n_x, self.layout.n_u
+        E, *model = (x.contiguous() for x in self.layout.stage_blocks(C)[0].split(sizes, dim=-1))
+        model = (*model, *[E] * (sizes[0] > 0))
         _check_tied("C", C, self(*model))
         return model
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_tensor, ungraded
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.qp.program import broadcast
 
 P = ParamSpec("P")
@@ -25,14 +26,14 @@ COST = ("H", "H_f", "q", "c", "w")
 CONSTRAINTS = ("C", "b", "G", "lb", "ub")
 
 
-def check_learn(learn: Collection[str], structure: str, n_linear: int) -> None:
+def check_learn(learn: Collection[str], structure: str, layout: Layout) -> None:
     """Raise `QPError` unless ``learn`` has names of parts that a QPMPC can learn."""
     parts = (*COST, *CONSTRAINTS)
     several = isinstance(learn, Collection) and not isinstance(learn, str)
     if not several or not all(isinstance(part, str) and part in parts for part in learn):
         expected = f"a collection of names among {', '.join(parts)}"
         raise QPError.expected("learn", repr(learn), expected)
-    if "G" in learn and structure != "free" and not n_linear:
+    if "G" in learn and structure != "free" and not layout.n_mixed + layout.n_terminal:
         remedy = "Pass constraints, or structure='free'."
         raise QPError.expected("learn", "'G' without constraints", "other parts", remedy)
 
