@@ -30,12 +30,8 @@ APART = 2.0**14
 PASSES = 8
 #: QPs share a length if theirs, as powers of two, have the same quotient by this.
 ALIKE = 7
-#: Entries of b below this, relative to the largest, are what rounding leaves of zeros.
+#: Entries below this, relative to the largest, may be what rounding leaves of zeros.
 ROUNDING = 2.0**-40
-#: Entries of matrices below this, relative to the largest of their row and column, ..
-VANISHING = 2.0**-60
-#: .. where those are near one after so many passes, set no unit.
-FIRST = 3
 
 
 class Units(NamedTuple):
@@ -166,20 +162,20 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
     first = np.concatenate((m * n + i, np.full(len(k), M * n)))
     second = np.concatenate((m * n + j, k * n + column))
 
-    def equilibrated(typical: Any, kept: np.ndarray, passes: int, step: float) -> Any:
+    def equilibrated(typical: Any, kept: np.ndarray, step: float) -> tuple[Any, Any]:
         """Return units, and scaled entries whose typical ones, of those kept, are near zero."""
         units = np.zeros(M * n + 1)
-        for _ in range(passes):
+        for _ in range(PASSES):
             scaled = sizes + units[first] + units[second]
             scaled -= typical(line[kept], scaled[kept], M * r + M)[line]
             units[:-1] -= step * typical(second[kept], scaled[kept], M * n)
         return units[:-1].reshape(M, n), scaled
 
-    units, scaled = equilibrated(_largest, np.bincount(line)[line] > 1, FIRST, 0.5)
+    units, scaled = equilibrated(_largest, np.bincount(line)[line] > 1, 0.5)
     for _ in range(2):
         of_line, of_column = (_largest(x, scaled, x.max() + 1)[x] for x in (line, second))
-        kept = scaled > np.log2(VANISHING) + np.minimum(of_line, of_column)
-        units, scaled = equilibrated(_means, kept, PASSES, 1.0)
+        kept = scaled > np.log2(ROUNDING) + np.minimum(of_line, of_column)
+        units, scaled = equilibrated(_means, kept, 1.0)
     return np.exp2(np.round(units))
 
 
