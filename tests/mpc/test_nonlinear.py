@@ -302,6 +302,30 @@ def test_plans_on_their_bounds_are_within_them_and_converge(unit):
     assert_close(solution.value, want, rtol=1e-5, atol=1e-6)
 
 
+def test_a_signal_that_only_rounding_moves_has_no_curvature(monkeypatch):
+    """A constant target had one of 1e19: rounding of eigenvectors in units of rounding."""
+
+    def arm(x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        angle, speed, target = x.unbind(-1)
+        u = u[..., 0]
+        after = angle + 0.1 * speed, 0.9 * speed + u, target + 1e-18 * speed
+        far = (angle.sin() - 50 * target) ** 2 + 0.1 * (angle.cos() - target * speed) ** 2
+        return torch.stack(after, -1), far + 1e-2 * u**2 + 1e-3 * (speed - target) ** 2
+
+    own, curvatures = nonlinear.solve, []
+
+    def spy(*arguments: Any) -> Any:
+        curvatures.append(arguments[0].H.abs().max())
+        return own(*arguments)
+
+    monkeypatch.setattr(nonlinear, "solve", spy)
+    bounds: Any = {"action_bounds": ([-10.0], [10.0]), "gamma": 1.0, "stage_weight": [0.0] * 4}
+    mpc = QPMPC.of(3, 1, 20, dynamics=arm, solver="daqp", **bounds)
+    value = mpc.value(torch.tensor([[1.0, 0.0, 0.0181], [0.2, 0.5, -0.0181]]).double())
+    assert_close(value, torch.tensor([0.25585, 17.666119]).double(), rtol=1e-5, atol=0)
+    assert max(curvatures) < 10
+
+
 def test_a_search_goes_on_nearer_to_its_plan_if_a_qp_is_not_solved(monkeypatch):
     mpc, own, calls = made(priced=True), nonlinear.solve, []
 

@@ -345,7 +345,8 @@ class SequentialQP(nn.Module):
         tries = tries[:, :, self.held]
         z, costs = self.simulated(p.unsqueeze(1), tries)
         w = z[:, 1:, self.entries[:, layout.n_d :]].nan_to_num(0, 0, 0)
-        most = F.pad(w.amax((1, 2)) - w.amin((1, 2)), (layout.n_d, 0))
+        most = w.amax((1, 2)) - w.amin((1, 2))
+        most = F.pad(most.where(most > ROUNDING * w.abs().amax((1, 2)), 0.0), (layout.n_d, 0))
         least = merit(every, z, costs).amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
         price = torch.where(hard, FIRM * least / bound, price)
         best = merit(every, z, costs).argmin(1)
