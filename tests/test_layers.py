@@ -34,7 +34,7 @@ BUDGET = {
     "export": 1446,
     "learning": 2796,  # models that did not train theta decide in improve
     "identification": 2656,  # dead times beyond the orders are told
-    "mpc": 3838,
+    "mpc": 3839,
     "proofs": 1001,
     "qp": 5293,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
