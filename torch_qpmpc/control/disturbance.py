@@ -26,14 +26,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from torch_qpmpc.control.scaling import Scaling
+from torch_qpmpc.control.scaling import Scaling, but_rounding
 from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 
 #: A singular value below this fraction of the largest is zero.
 RANK = 1e-9
-#: Entries of a column that are this small relative to its largest are what rounding leaves of zero.
-ROUNDING = 1e-14
 #: Weighted outputs whose responses differ by a smaller part of them are one.
 FLAT = RANK**0.5
 #: Sizes that differ by a smaller part of them are equal.
@@ -137,18 +135,15 @@ def _automatic(plant: StateSpace, tolerance: float) -> dict[str, str]:
     n, _, n_y, _ = plant.sizes
     U, sizes, _ = np.linalg.svd(plant.A - np.eye(n))
     modes = U[:, sizes <= tolerance * max(sizes[0], 1.0)].T  # of A', near one
-    taken = [plant.inputs[i] for i in _independent(modes @ plant.B)[:n_y]]
-    columns = [plant.B[:, plant.inputs.index(name)] for name in taken]
-    columns = np.column_stack((plant.A - np.eye(n), *columns))
-    columns = np.vstack((columns, np.pad(plant.C, ((0, 0), (0, len(taken))))))
+    taken = _independent(modes @ plant.B)[:n_y]
+    shown = np.pad(plant.C, ((0, 0), (0, len(taken))))
+    columns = np.block([[plant.A - np.eye(n), plant.B[:, taken]], [shown]])
     # Output disturbances fill what the other columns leave.
     rest = scipy.linalg.null_space(columns.T, rcond=RANK)[n:].T
-    at_outputs, inputs = _independent(rest)[: n_y - len(taken)], iter(taken)
-    kinds = {
-        name: OUTPUT if i in at_outputs else next(inputs, "")
-        for i, name in enumerate(plant.outputs)
-    }
-    return {name: kind for name, kind in kinds.items() if kind}
+    kinds = {plant.outputs[i]: OUTPUT for i in _independent(rest)[: n_y - len(taken)]}
+    others = (name for name in plant.outputs if name not in kinds)
+    kinds |= zip(others, (plant.inputs[i] for i in taken), strict=False)
+    return {name: kinds[name] for name in plant.outputs if name in kinds}
 
 
 def _independent(matrix: Array) -> list[int]:
@@ -156,7 +151,7 @@ def _independent(matrix: Array) -> list[int]:
     matrix = matrix * (1 - TIE * np.arange(matrix.shape[1]))
     _, R, order = map(np.asarray, scipy.linalg.qr(matrix, mode="economic", pivoting=True))
     sizes = np.abs(np.diag(R))
-    return [int(i) for i, x in zip(order, sizes, strict=False) if x > RANK * sizes[0]]
+    return [int(i) for i, x in zip(order, sizes, strict=False) if x > RANK * max(sizes[0], 1.0)]
 
 
 def _hidden(plant: StateSpace, placed: Disturbances) -> str | None:
@@ -243,9 +238,8 @@ class Steady:
             Y[:, -len(W) :][np.abs(Y[:, -len(W) :]) < RANK] = 0.0
             U[np.abs(U) < RANK] = 0.0
         size = np.concatenate((sizes.x, sizes.u, sizes.y))[:, None]
-        maps = np.vstack((X, U, Y)), np.vstack((x, u, y))
-        for part in maps:  # rounding would set the lengths of the target's QP
-            part[np.abs(part) < ROUNDING * np.abs(part).max(0)] = 0.0
+        parts = np.vstack((X, U, Y)), np.vstack((x, u, y))
+        maps = (but_rounding(part, np.abs(part).max(0)) for part in parts)  # it would set lengths
         (X, U, Y), (x, u, y) = (np.split(size * part, (n, n + m)) for part in maps)
         return cls(X, U, Y, x, u, y + np.hstack((w.C, np.zeros((len(w.C), n_d + 1)))), W)
 

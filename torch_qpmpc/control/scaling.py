@@ -15,6 +15,8 @@ from torch_qpmpc.export.tables import FAR
 
 #: The fewest steps of the responses that sizes follow from.
 STEPS = 20
+#: Entries this small relative to what they are beside are what rounding leaves of zero.
+ROUNDING = 1e-14
 #: Weight of outputs beside an input that is at rest with them: it decides for integrators.
 FAINT = 1e-6
 Bounds = tuple[Array, Array]
@@ -47,25 +49,30 @@ class Scaling(NamedTuple):
         n, m, n_y, _ = plant.sizes
         growth = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max(initial=0.0))
         A, count = plant.A / growth, max(steps, n, STEPS)  # modes that grow would hide the others
-        x, seen, shown = np.zeros((n, m)), plant.C, np.zeros((n_y, n))
-        X, Y = np.zeros((n, m)), np.zeros((n_y, m))
-        for _ in range(count):
-            x = A @ x + plant.B
-            X, Y = np.maximum(X, np.abs(x)), np.maximum(Y, np.abs(plant.C @ x))
-            shown, seen = np.maximum(shown, np.abs(seen)), seen @ A
         y, u = (
             np.zeros(k) if b is None else ranges(b) for k, b in ((n_y, y_bounds), (m, u_bounds))
         )
         weight = np.zeros(n_y) if Q is None else np.sqrt(np.diag(Q))
-        u = _within(u, _inverse((Y * weight[:, None]).max(0)))
+        of_u = _first(u, np.ones(m))
+        driven = np.hstack((plant.B * of_u, plant.E))
+        x, seen, shown = np.zeros_like(driven), plant.C, np.zeros((n_y, n))
+        X, Y = np.zeros_like(x), plant.C @ x
+        for _ in range(count):
+            x = A @ x + driven
+            X, Y = np.maximum(X, np.abs(x)), np.maximum(Y, np.abs(plant.C @ x))
+            shown, seen = np.maximum(shown, np.abs(seen)), seen @ A
+        parts = (np.abs(plant.C) @ X).max(1, keepdims=True)  # of Y, which may cancel
+        X, Y = X[:, :m] / of_u, but_rounding(Y, parts)[:, :m] / of_u
+        rest = _first(_inverse(Y.max(0)), np.ones(m))
+        aiming = _inverse((Y * _first(weight, _inverse(y))[:, None]).max(0))
+        u = _within(u, _first(aiming, rest))
         y = _within(y, np.maximum((Y * u).max(1, initial=0.0), _inverse(weight)))
         aimed = _first(y, (Y * u).max(1, initial=0.0), _inverse(weight))
         aiming = _inverse((Y * _inverse(aimed)[:, None]).max(0))
-        u = _first(u, aiming, _inverse(Y.max(0)))
-        u = _first(u, _inverse(X.max(0)), np.ones(m))
+        u = _first(u, aiming, rest)
         y = _first(y, (Y * u).max(1, initial=0.0), aimed, np.ones(n_y))
-        moved = (X * u).max(1, initial=0.0)
         shows = _inverse((shown * _inverse(y)[:, None]).max(0))
+        moved = but_rounding((X * u).max(1, initial=0.0), shows)
         x = _first(np.sqrt(moved * shows), moved, shows, np.ones(n))
         effect = (np.abs(plant.E) / x[:, None]).max(0)
         return cls(y, u, x, _first(_inverse(effect), np.ones(len(effect))))
@@ -86,7 +93,8 @@ class Scaling(NamedTuple):
         if visited is not None:
             visited = visited[0] / x, visited[1] / x / x[:, None]
         names = plant.inputs, plant.outputs, plant.known
-        return StateSpace(*matrices, None, *names, noise=noise, visited=visited)
+        A, B, C, E, offset = map(but_rounding, matrices)
+        return StateSpace(A, B, C, E, offset, None, *names, noise=noise, visited=visited)
 
     def at_rest(
         self, plant: StateSpace, u: Array, d: Array, y: Array | None = None, weight: float = 1.0
@@ -109,6 +117,11 @@ def ranges(bounds: Bounds) -> Array:
     """Return half the distance of the bounds, and zero where there is none, or one is far away."""
     half, near = (bounds[1] - bounds[0]) / 2, np.minimum(*np.abs(bounds))
     return _within(np.where(np.isfinite(half) & (half > 0), half, 0.0), near)
+
+
+def but_rounding(sizes: Array, others: Array | float = 1.0) -> Array:
+    """Return the sizes, and zero where rounding may leave as much of others."""
+    return np.where(np.abs(sizes) <= ROUNDING * others, 0.0, sizes)
 
 
 def _within(sizes: Array, others: Array) -> Array:
