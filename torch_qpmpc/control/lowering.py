@@ -29,7 +29,7 @@ import torch
 from scipy.linalg import block_diag
 
 from torch_qpmpc.control.design import Design, Target
-from torch_qpmpc.control.disturbance import RANK, ROUNDING, null_direction, unseen_modes
+from torch_qpmpc.control.disturbance import RANK, null_direction, unseen_modes
 from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.bounds import Bounds
@@ -128,7 +128,7 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     normal, (of_y, of_u, of_x, _), of_r = design.normal, design.scaling, design.weighted
     A, B, C = normal.plant.A, normal.plant.B, normal.plant.C
     still, right = np.eye(len(A)) - design.gamma * A.T, 2 * C.T @ normal.Q[:, of_r]
-    still[np.abs(still) < ROUNDING] = 0.0  # of modes at one
+    still[np.abs(still) < RANK] = 0.0  # of modes at one
     response = np.linalg.pinv(still, rcond=RANK)
     size, slope = np.linalg.norm(response) * np.linalg.norm(right), response @ right
     free = scipy.linalg.null_space(still, rcond=RANK)
@@ -144,9 +144,10 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
         L = L - L @ (Y @ to_r / of_y[of_r, None])
         L = L + P @ (np.vstack(maps)[: len(P)] @ to_r / sizes[:, None])
     values, V = np.linalg.eigh(P)
-    own = V.T @ L / np.sqrt(np.maximum(values, TINY * values[-1]))[:, None]
-    of_r = of_y[of_r]
-    return L / np.outer(sizes, of_r), own.T @ own / np.outer(of_r, of_r)
+    values, V = values[costly := values > TINY * values[-1]], V[:, costly]
+    own = V.T @ L / np.sqrt(values)[:, None]
+    of_r = of_y[of_r]  # and a slope without a cost would have no least value
+    return V @ V.T @ L / np.outer(sizes, of_r), own.T @ own / np.outer(of_r, of_r)
 
 
 def riccati(design: Design) -> Array | None:
