@@ -19,7 +19,7 @@ from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import ROUNDS, SHRINKS, STAYS
 from torch_qpmpc.control.observer import STEADY
 from torch_qpmpc.control.simulation import centre, closed_loop, last_known
-from torch_qpmpc.control.state_space import Array, StateSpace
+from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.export import Export, build, check_name, refuse
 from torch_qpmpc.export.fmu import Variable, write_fmu
@@ -264,7 +264,12 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
 
 def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict[str, str]:
     """Return the texts of ``name.h`` and ``name.c``."""
-    design = law.design
+    design, plant = law.design, law.design.plant
+    every = "" if plant.dt is None else f", a step every {plant.dt:g}"
+    header = [f"{name}: a linear MPC with an observer, by torch_qpmpc{every}."]
+    header += ["Its state has @BYTES@ bytes."]
+    groups = {"y and r": plant.outputs, "known": plant.known, "u": plant.inputs}
+    header += [f"{k}: {', '.join(map(plant.label, x))}" for k, x in groups.items() if x]
     sizes = {f"{name.upper()}_{key}": size for key, size in _sizes(law).items()}
     sizes[f"{name.upper()}_CARRIES"] = int(missing)
     defined = "\n".join(f"#define {key} {size}" for key, size in sizes.items())
@@ -281,23 +286,12 @@ def _sources(law: Law, name: str, dtype: str, loop: Loop, missing: bool) -> dict
     shown = [f"#define EXAMPLES {len(replayed.u)}"]
     shown += [array(key, x, dtype) for key, x in examples.items()]
     parts = {
-        "/* @HEADER@ */": comment(_signals(law.design.plant, name)),
+        "/* @HEADER@ */": comment(header),
         "/* @SIZES@ */": defined,
         "/* @TABLES@ */": "\n".join([f"#define BIG {CONSTANTS[dtype]['BIG']}", *tables]),
         "/* @EXAMPLES@ */": "\n".join(shown),
     }
     return {f"{name}.{end}": filled(f"controller.{end}", name, parts) for end in "hc"}
-
-
-def _signals(plant: StateSpace, name: str) -> list[str]:
-    """Describe the entries of y, r, known and u."""
-    every = "" if plant.dt is None else f", a step every {plant.dt:g}"
-    groups = {"y and r": plant.outputs, "known": plant.known, "u": plant.inputs}
-    return [
-        f"{name}: a linear MPC with an observer, by torch_qpmpc{every}.",
-        "Its state has @BYTES@ bytes.",
-        *(f"{key}: {', '.join(map(plant.label, names))}" for key, names in groups.items() if names),
-    ]
 
 
 def _sizes(law: Law) -> dict[str, int]:

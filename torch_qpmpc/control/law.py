@@ -454,10 +454,7 @@ class Law:
         self, known: Any, rows: int, least: int | None = None, sane: bool = True
     ) -> Array:
         """`read` known signals from one row or at least ``least``, by default all."""
-        names = self.design.plant.known
-        if not names and known is None:
-            return np.zeros((rows, 0))
-        if known is None:
+        if known is None and (names := self.design.plant.known):
             remedy = "Pass a forecast of N + 1 rows, or one row that is held; an environment has "
             remedy += "it in info['known']."
             raise QPError.expected("known", "None", f"the signals {', '.join(names)}", remedy)
