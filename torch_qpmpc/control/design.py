@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
 from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
-from torch_qpmpc.control.scaling import Scaling, ranges
+from torch_qpmpc.control.scaling import Scaling, but_rounding, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import DEFAULTS, hull, read_levels
@@ -349,19 +349,20 @@ class Design:
         return nominal
 
     def answers(self, shows: float) -> Array:
-        """Return the first steps in which inputs move outputs their final way, ``(n_y,)``."""
+        """Return the first steps, 0 of none, in which inputs move outputs their final way."""
         # By a part ``shows`` of the largest move of the next ten steps.
-        plant, x, steps = self.plant, self.plant.B * self.scaling.u, []
+        plant, x, steps = self.normal.plant, self.normal.plant.B, []
+        growth = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
         for _ in range(max(10 * self.horizon, 200)):
-            steps.append(plant.C @ x)
-            x = plant.A @ x
-        sign, moves = np.sign(np.cumsum(steps, 0))[:-9], np.abs(steps)
+            steps.append(but_rounding(plant.C @ x))
+            x = plant.A @ x / growth
+        sign, moves = np.sign(np.cumsum(steps, 0).round(9))[:-9], np.abs(steps)
         ahead = np.lib.stride_tricks.sliding_window_view(moves.max(2), 10, axis=0).max(-1)
         away = np.logical_and.accumulate(moves[:-9] <= shows * ahead[..., None])
-        if np.abs(np.linalg.eigvals(plant.A)).max() < 1 + 1e-9:
-            away |= sign != sign[-1]
+        if growth < 1 + 1e-4:
+            away |= (sign != sign[-1]) & (sign[-1] != 0)
         away = np.pad(away, ((1, 0), (0, 0), (0, 0)), constant_values=True)
-        return (len(away) - away[::-1].argmax(0)).min(-1)
+        return (len(away) - away[::-1].argmax(0)).min(-1) % len(away)
 
     @cached_property
     def margins(self) -> Array:

@@ -102,7 +102,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         return Review(findings)
     loop = LinearLoop.of(mpc, law.observer)
     findings.append(_stability(loop, design.gamma, terminal.remedy))
-    if loop.radius < 1:
+    if findings[-1].ok:
         findings += [_margin(loop, law), _offset(loop, design)]
         if design.plant.noise is not None and findings[-3].ok:
             findings.append(_noise(loop, law, design.plant.noise))
@@ -199,7 +199,7 @@ def _violation(design: Design) -> Finding:
 def _horizon(design: Design) -> Finding:
     """The plan is longer than dead times and inverse responses."""
     N, first = design.horizon, design.answers(SHOWS)
-    numbers = {design.plant.outputs[i]: int(first[i]) for i in design.weighted}
+    numbers = {design.plant.outputs[i]: int(first[i]) for i in design.weighted if first[i]}
     needed = max(numbers.values(), default=1)
     ok = needed < N or needed == 1
     after = "".join(f", until an input moves {name} {x}" for name, x in numbers.items())
