@@ -53,7 +53,7 @@ class Scaling(NamedTuple):
             np.zeros(k) if b is None else ranges(b) for k, b in ((n_y, y_bounds), (m, u_bounds))
         )
         weight = np.zeros(n_y) if Q is None else np.sqrt(np.diag(Q))
-        of_u = _first(u, np.ones(m))
+        of_u = _first(_within(u, np.ones(m)), np.ones(m))
         driven = np.hstack((plant.B * of_u, plant.E))
         x, seen, shown = np.zeros_like(driven), plant.C, np.zeros((n_y, n))
         X, Y = np.zeros_like(x), plant.C @ x
