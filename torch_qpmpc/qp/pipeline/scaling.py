@@ -151,8 +151,8 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
     Their logarithms, and those of units of the rows and of the cost, bring those of the entries
     nearest to zero (Curtis and Reid, 1972). So a signal's own bounds, which any unit suits, have no
-    part in its unit. Nor have entries that vanish beside the largest of their row and column, which
-    are made one first (Ruiz, 2001): what rounding leaves of zeros, and exponentials in a cost.
+    part in its unit. Nor have entries that vanish beside the largest of their row and column, once
+    those are near one (Ruiz, 2001): what rounding leaves of zeros, and exponentials in a cost.
     """
     (M, n, _), r = H.shape, rows.shape[1]
     # The matrices of an MPC scheme are sparse. An entry of H belongs to two of z.
