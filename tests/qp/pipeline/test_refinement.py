@@ -172,6 +172,29 @@ def test_what_has_no_solution_is_left_as_it_was():
     assert_close(candidate.z, solution.z, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("held", [1, 2, 3])
+def test_soft_rows_that_the_equations_put_beyond_their_bounds_are_saturated(held, side):
+    """An output that rested at its bound, 3e-7 beyond it, left the plan's QP unsolved."""
+    bound = (1 - 3e-7) * torch.tensor([1.0, 0.5, 0.25], dtype=torch.float64)[:held]
+    G, C = torch.eye(4, dtype=torch.float64)[:held], torch.zeros(3, 4, dtype=torch.float64)
+    C[0, 0] = 1.0  # x_0 = 1, x_1 = x_0 / 2, x_2 = x_1 / 2
+    C[1, :2] = C[2, 1:3] = torch.tensor([-0.5, 1.0])
+    b, far = torch.tensor([side, 0, 0], dtype=torch.float64), torch.full((held,), torch.inf)
+    lb, ub = (-far, bound) if side > 0 else (-bound, far)
+    f = {"ub": ub.double(), "lb": lb.double(), "w": torch.full((held,), 5.0).double()}
+    qp = QuadraticProgram(H=torch.eye(4).double(), q=torch.ones(4).double(), C=C, b=b, G=G, **f)
+    p, _ = Programs.of(*qp.tensors(), torch.empty(1, 0, dtype=torch.float64))
+    right = solve_programs(p, "daqp")
+    start = right.at(np.arange(1))
+    start.lam[:] *= 0.4
+    start.status[:] = 3
+    refine(p, start, np.arange(1))
+    assert start.status[0] == 0
+    assert_close(start.lam, right.lam, rtol=1e-12, atol=0)
+    assert_close(start.value, right.value, rtol=1e-12, atol=0)
+
+
 def test_rows_that_are_dependent_up_to_rounding_are_certified():
     """A basis of rows whose sine was just above 1e-14 made an exact answer's error 36."""
     case = FAMILIES["dependent rows"](Draw(3), 128)

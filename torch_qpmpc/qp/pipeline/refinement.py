@@ -75,7 +75,7 @@ def refine(
             refined = _solve(programs.one(i), solution.z[i], solution.lam[i])
         except (np.linalg.LinAlgError, RuntimeError):  # of numbers that overflowed
             refined = None
-        if refined is not None:
+        if refined is not None and not refined.status:
             chi, xi = np.split(refined.chi, [solution.chi.shape[1]])
             iterations = solution.iterations[i] + refined.iterations
             solution.put(i, refined._replace(chi=chi, xi=xi, iterations=iterations))
@@ -83,7 +83,7 @@ def refine(
 
 @np.errstate(all="ignore")  # a set without a solution has none that is finite
 def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
-    """Solve from the rows whose multiplier is larger than their slack; None if no set does."""
+    """Solve from the rows whose multiplier is larger than their slack; None if no set has one."""
     force, sign, slip, x = np.abs(lam) * np.abs(qp.G).sum(-1), np.sign(lam), EXACT, None
     share, below = force / max(force.max(initial=0.0), TINY), 1 - np.abs(lam) / (qp.w + TINY)
     beyond = sign * (qp.G @ z - np.where(lam > 0, qp.ub, qp.lb)) / (_row_sizes(qp, z) + TINY)
@@ -91,7 +91,7 @@ def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
     saturated = (qp.w < np.inf) & (lam != 0) & (below <= np.maximum(beyond, 0))
     codes = np.where(saturated, 2 * sign, held * np.where(sign == 0, 1, sign)).astype(np.int8)
     work = (len(qp.q) + len(qp.b) + np.count_nonzero(codes)) ** 3
-    for sets in range(1, int(min(MAX_SETS, 2 + MAX_WORK / work)) + 1):
+    for sets in range(1, int(min(MAX_SETS, 3 + MAX_WORK / work)) + 1):
         system = _System.of(qp, codes)
         x = system.solution(x if x is not None else system.start(z, lam))
         if x is None:
@@ -102,7 +102,9 @@ def _solve(qp: Theta, z: np.ndarray, lam: np.ndarray) -> BatchSolution | None:
         contradiction, states = point.contradictions(slip)
         if not contradiction.any():
             solution = point.judged(system.errors(x), sets)
-            return None if solution.status else solution
+            if not solution.status or slip == EXACT:
+                return solution
+            contradiction, states = point.contradictions(EXACT)
         codes = np.where(contradiction > 0, states, codes)
     return None
 
@@ -236,10 +238,14 @@ class _Point(NamedTuple):
         back = saturated * np.where(codes > 0, -above, -below)
         # Of 0 times inf, the state that a row is not in.
         by = np.nan_to_num(np.stack((over, inwards, outside, back)), nan=0)
-        states = (2 * np.sign(lam), 0 * sign, np.where(above > below, 1, -1), sign)
-        worst = by.argmax(0)
+        at_bound = np.where(above > below, 1, -1)
+        states = (2 * np.sign(lam), 0 * sign, at_bound, sign)
+        state = np.choose(by.argmax(0), states).astype(np.int8)
         by = by.max(0, initial=0.0)
-        state = np.choose(worst, states).astype(np.int8)
+        # A soft row that the equations put beyond its bound is not held, but saturated.
+        beyond = np.where(held & (qp.w < np.inf), np.maximum(above, below), 0.0)
+        if beyond.max(initial=0.0) > slip:
+            by, state = beyond, 2 * at_bound
         return np.where(by > slip, by, 0.0), state
 
     def judged(self, errors: np.ndarray, sets: int) -> BatchSolution:
