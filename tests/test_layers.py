@@ -36,7 +36,7 @@ BUDGET = {
     "identification": 2656,  # dead times beyond the orders are told
     "mpc": 3839,
     "proofs": 1001,
-    "qp": 5293,
+    "qp": 5295,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

@@ -184,4 +184,5 @@ if __name__ == "__main__":
     for name, run in {**runs, "all known": plan}.items():
         print(f"{name}: {cost(one, run) / DAYS:.3f} EUR a day")
     print(f"no plan costs less than {bound / DAYS:.3f}")
-    figure(one, runs).savefig(sys.argv[1], dpi=80)
+    for path in sys.argv[1:]:
+        figure(one, runs).savefig(path, dpi=80)
