@@ -72,29 +72,29 @@ class LearnedModel(nn.Module):
         """Return the next x ``(*batch, n_x)``, and the stage cost ``(*batch,)`` if observed."""
         return self.folded()(x, u, *d)
 
-    def folded(self) -> Callable[..., Tensor | tuple[Tensor, Tensor]]:
+    def folded(self) -> Callable[..., Any]:
         """Return `forward` with its weights in the units of w = [d; x; u], for call after call."""
         n, middle, size = len(self.middle), self.middle, self.size
         layers = [getattr(self, f"layer_{i}") for i in range(self.depth)]
-        W, b, products = self.base[1 : 1 + n], self.base[0], self.base[1 + n :]
+        W, b, products = self.base[1 : 1 + n] / size.unsqueeze(-1), self.base[0], self.base[1 + n :]
         if layers:
             W_1, b_1, W_2, b_2, W_3, b_3 = layers
-            W, b = torch.cat((W_1, W), -1), torch.cat((b_1, b + b_3))
-        W = W / size.unsqueeze(-1)
-        b = b - middle @ W
+            K, b = len(W_2), b + b_3
+            b_1, W_3 = (b_1 - middle / size @ W_1).view(K, 1, -1), W_3.view(K, -1, len(b))
+            W_1 = (W_1 / size.unsqueeze(-1)).view(n, K, -1).transpose(0, 1)
+        b, curved = b - middle @ W, bool(products.any())
 
         def step(x: Tensor, u: Tensor, *d: Tensor) -> Tensor | tuple[Tensor, Tensor]:
             w = torch.cat((*d, x, u), -1).to(middle)
             rows = w.reshape(-1, n)
             out = torch.addmm(b, rows, W)
             if layers:
-                hidden, out = out.tensor_split((len(b_1),), 1)
-                hidden = F.silu(hidden).view(len(rows), len(W_2), -1).transpose(0, 1)
-                hidden = F.silu(torch.baddbmm(b_2, hidden, W_2)).transpose(0, 1).flatten(1)
-                out = torch.addmm(out, hidden, W_3)
-            if len(products):
+                hidden = F.silu(torch.baddbmm(b_1, rows.expand(K, -1, -1), W_1))
+                hidden = F.silu(torch.baddbmm(b_2, hidden, W_2))
+                out = out + torch.bmm(hidden, W_3).sum(0)
+            if curved:
                 out = out + _products((rows - middle) / size) @ products
-            out = out.reshape(*w.shape[:-1], -1)
+            out = out.reshape(*w.shape[:-1], out.shape[-1])
             after = x + out[..., : self.n_x]
             return (after, out[..., -1]) if out.shape[-1] > self.n_x else after
 
