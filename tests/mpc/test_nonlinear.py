@@ -84,8 +84,10 @@ def test_derivatives_are_those_of_automatic_differentiation(n_d, priced):
             out = model(x, u, *(d,) * n_d)
             return torch.cat((out[0], out[1][..., None]), -1) if isinstance(out, tuple) else out
 
-        J, W = of_networks(model, w)
+        out, J, W = of_networks(model, w)
         J[:, :2, n_d : n_d + 2] += torch.eye(2)  # x+ is x and its change
+        out[:, :2] += w[:, n_d : n_d + 2]
+        assert_close(out, outputs(w))
         assert_close(J, torch.func.vmap(torch.func.jacrev(outputs))(w))
         if priced:
             cost = torch.func.hessian(lambda w: outputs(w)[-1])
@@ -478,6 +480,10 @@ def test_a_batch_may_have_its_own_prices_or_no_states():
     assert_close(mpc.value(s, mpc.quadratic_program({"w": own})), mpc.value(s), rtol=1e-5, atol=0)
     assert mpc.value(s[:0]).shape == (0,)
     assert mpc.predict(s[:0]).shape == (0, 1)
+    layers = [torch.ones(x) for x in ((2, 6), (6,), (2, 3, 3), (2, 1, 3), (6, 2), (2,))]
+    model = LearnedModel(torch.zeros(2), torch.ones(2), torch.zeros(6, 2), 1, layers)
+    mpc = QPMPC.of(1, 1, 5, dynamics=model, **bounds, **options)
+    assert mpc.value(s[:0]).shape == (0,)
 
 
 def test_a_module_may_have_attributes_of_any_name():

@@ -33,7 +33,7 @@ from torch_qpmpc.qp.batching import times
 from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import report
-from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status
+from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
 from torch_qpmpc.qp.solution import QPSolution, saturated_rows
 from torch_qpmpc.qp.solve import Eager, solve
 from torch_qpmpc.qp.tracing import is_eager
@@ -42,6 +42,8 @@ from torch_qpmpc.qp.tracing import is_eager
 RANDOM, HOLD = 6, 5
 #: The fractions of a step that are tried.
 FRACTIONS = (1.0, 0.5, 0.2, 0.04)
+#: So many derivatives of networks are computed at once: more do not fit in the caches.
+ROWS = 128
 #: The proximal term in terms of H's diagonal: first, least, most, and its change by each QP.
 FIRST, LEAST, MOST, CHANGE = 1e-2, 1e-9, 1e4, 4.0
 #: A converged plan's step, and a rise of the cost that is rounding, relatively; too large a state.
@@ -199,10 +201,10 @@ class SequentialQP(nn.Module):
         f = self.dynamics.folded() if isinstance(self.dynamics, LearnedModel) else self.dynamics
         for d_k, u_k in zip(d[:-1], u.unbind(-2), strict=True):
             x, cost = self.stage(d_k, x, u_k, f=f)
-            states.append(x.to(u))
-            costs += [] if cost is None else [cost.to(u)]
-        z = torch.cat((p, torch.cat((u, torch.stack(states, -2)), -1).flatten(-2)), -1)
-        return z, torch.stack(costs, -1) @ self.powers if costs else z.new_zeros(z.shape[:-1])
+            states.append(x)
+            costs += [] if cost is None else [cost]
+        z = torch.cat((p, torch.cat((u, torch.stack(states, -2).to(u)), -1).flatten(-2)), -1)
+        return z, torch.stack(costs, -1).to(u) @ self.powers if costs else z.new_zeros(z.shape[:-1])
 
     def curvature(self, w: Tensor, weights: Tensor) -> Tensor:
         """Return the Hessians of ``weights``'[x+, l] in w, ``(.., n, n)``."""
@@ -218,11 +220,11 @@ class SequentialQP(nn.Module):
     def moved(self, of_x: Tensor, most: Tensor) -> Tensor:
         """Return how far actions move w ``(B, N, n)``: roots of Gramians, at most ``most``."""
         _, A, B = of_x.split(self.sizes, -1)
-        B, S, sizes = B * most[:, None, None, -self.layout.n_u :], torch.zeros_like(A[:, 0]), []
-        for A_k, B_k in zip(A.unbind(1), B.unbind(1), strict=True):
-            sizes.append(S.diagonal(dim1=1, dim2=2).sqrt().nan_to_num(torch.inf))
-            S = A_k @ S @ A_k.mT + B_k @ B_k.mT
-        sizes = F.pad(torch.stack(sizes, 1), self.sizes[::2], value=torch.inf)
+        B, S = B * most[:, None, None, -self.layout.n_u :], [torch.zeros_like(A[:, 0])]
+        for A_k, of_u in zip(A[:, :-1].unbind(1), (B @ B.mT).unbind(1), strict=False):
+            S.append(torch.baddbmm(of_u, A_k @ S[-1], A_k.mT))
+        sizes = torch.stack(S, 1).diagonal(dim1=2, dim2=3).sqrt().nan_to_num(torch.inf)
+        sizes = F.pad(sizes, self.sizes[::2], value=torch.inf)
         return sizes.maximum(LEVER * most.unsqueeze(1)).minimum(most.unsqueeze(1))
 
     def along(self, qp: QuadraticProgram, z: Tensor, chi: Any, most: Any) -> QuadraticProgram:
@@ -234,10 +236,12 @@ class SequentialQP(nn.Module):
         w, powers, n_c = z.detach()[:, self.entries], self.powers.unsqueeze(-1), len(self.C)
         n_d, n_x, W = self.layout.n_d, self.layout.n_x, None
         if chi is None and isinstance(self.dynamics, LearnedModel):
-            found = of_networks(self.dynamics, w.flatten(0, 1))
-            J, W = (x.unflatten(0, w.shape[:2]) for x in found)
-            out, J = self.outputs(w), F.pad(J, (0, 0, 0, n_x + 1 - J.shape[-2]))
+            parts = [of_networks(self.dynamics, x) for x in w.flatten(0, 1).split(ROWS)]
+            out, J, W = (torch.cat(x).unflatten(0, w.shape[:2]) for x in zip(*parts, strict=True))
+            out = F.pad(out, (0, n_x + 1 - out.shape[-1]))
+            J = F.pad(J, (0, 0, 0, n_x + 1 - J.shape[-2]))
             J[..., :n_x, n_d : n_d + n_x] += torch.eye(n_x).to(J)
+            out[..., :n_x] += w[..., n_d : n_d + n_x]
         else:
             out, J = _jacobian(self.outputs, w, n_x + 1, chi is not None)
         of_x, of_l = J[..., :-1, :], J[..., -1, :]
@@ -282,7 +286,7 @@ class SequentialQP(nn.Module):
             want = "one outside torch.compile, torch.func and losses without deactivate_vmap=True"
             raise QPError.expected("dynamics", "a traced call", want)
         N, n_u, batch = self.layout.horizon, self.layout.n_u, fixed.shape[:-1]
-        batch = torch.broadcast_shapes(qp.batch_shape, batch)
+        batch = broadcast(qp.batch_shape, batch)
         flat = [
             x if x.ndim == n else x.expand(*batch, *x.shape[x.ndim - n :]).flatten(0, -n - 1)
             for x, n in zip(qp.tensors(), NDIMS, strict=True)
@@ -296,10 +300,13 @@ class SequentialQP(nn.Module):
             want = f"a plan ({N}, {n_u}) for each of {len(fixed)} states"
             raise QPError.expected("warm_start", f"shape {tuple(plan.shape)}", want)
         with torch.no_grad():
-            plan, own = plan.to(fixed).reshape(len(fixed), N, n_u), _taken(flat)
-            u, known, converged = self._search(own, fixed.detach(), plan, n_kept, solver)
+            plan = plan.to(fixed).reshape(len(fixed), N, n_u)
+            u, known, converged = self._search(flat, fixed, plan, n_kept, solver)
             w, x = known[1][:, self.entries], self.layout.predicted(known[1])[0][:, 1:]
-            defect = (self.outputs(w)[..., :-1] - x).abs().amax((1, 2))
+            defect = torch.zeros_like(known[0])  # of what `simulated` returns
+            if converged.any():
+                off = self.outputs(w[converged])[..., :-1] - x[converged]
+                defect[converged] = off.abs().amax((1, 2))
         if on_failure != "mask" and known[5].any():
             report(known[5].cpu().numpy(), batch, on_failure)
         strict = None
@@ -322,35 +329,38 @@ class SequentialQP(nn.Module):
         layout, B, every = self.layout, len(fixed), torch.arange(len(fixed))
         n_p, n, N, p = layout.n_p, layout.n, layout.horizon, fixed[:, : layout.n_p]
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
-        hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G[..., of_x] != 0).any(-1)))
+        hard, moved = (x.expand(B, -1) for x in (qp.w.isinf(), (qp.G * of_x != 0).any(-1)))
         of_u, hard = hard & ~moved, hard & moved  # those of u alone no plan may violate
         price = torch.where(qp.w.isinf(), 0.0, qp.w).repeat(B if qp.w.ndim == 1 else 1, 1)
         bound = torch.stack((qp.lb, qp.ub)).abs().nan_to_num(posinf=0.0).amax(0)
         bound = torch.where(bound > 0, bound, 1.0).expand(B, -1)
 
-        def merit(index: Tensor, z: Tensor, costs: Tensor) -> Tensor:
-            """Return the cost of z ``(len(index), K, n_z)`` with the prices of violations."""
+        def rated(index: Tensor, z: Tensor, costs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            """Return z ``(len(index), K, n_z)``, its cost and the violations of rows."""
             own = _taken(qp, index, 1)
             y = times(own.G, z)
             over = torch.maximum(own.lb - y, y - own.ub).relu()
             far = (over > ROUNDING**0.5 * bound[index].unsqueeze(1)) & of_u[index].unsqueeze(1)
-            over = (price[index].unsqueeze(1) * over).masked_fill(far, torch.inf)
-            costs = costs + over.sum(-1) + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
-            return costs.nan_to_num(torch.inf, torch.inf, torch.inf)
+            costs = costs + own.c + (z * (times(own.H, z) / 2 + own.q)).sum(-1)
+            return z, costs, over.masked_fill(far, torch.inf)
+
+        def merit(price: Tensor, costs: Tensor, over: Tensor) -> Tensor:
+            """Return the costs with the prices of violations ``(.., n_g)``."""
+            return (costs + (price * over).sum(-1)).nan_to_num(torch.inf, torch.inf, torch.inf)
 
         tries = torch.cat((plan.unsqueeze(1), self._plans(qp).expand(B, -1, -1, -1)), 1)
         tries = torch.where(tries.isnan(), tries[:, 1:2], tries)
         if fixed.shape[1] > n_p:
             tries[:, :, 0] = fixed[:, None, n_p:]
         tries = tries[:, :, self.held]
-        z, costs = self.simulated(p.unsqueeze(1), tries)
+        z, costs, over = rated(every, *self.simulated(p.unsqueeze(1), tries))
         w = z[:, 1:, self.entries[:, layout.n_d :]].nan_to_num(0, 0, 0)
         most = w.amax((1, 2)) - w.amin((1, 2))
         most = F.pad(most.where(most > ROUNDING * w.abs().amax((1, 2)), 0.0), (layout.n_d, 0))
-        least = merit(every, z, costs).amin(1, keepdim=True).abs().nan_to_num(posinf=1.0)
-        price = torch.where(hard, FIRM * least / bound, price)
-        best = merit(every, z, costs).argmin(1)
-        u, z, costs = (x[every, best] for x in (tries, z, costs))
+        least = merit(price[:, None], costs, over).amin(1, keepdim=True)
+        price = torch.where(hard, FIRM * least.abs().nan_to_num(posinf=1.0) / bound, price)
+        best = merit(price[:, None], costs, over).argmin(1)
+        u, z, costs, over = (x[every, best] for x in (tries, z, costs, over))
         far = ~(z.abs() < OVERFLOW).all(1)
         z[far, n_p:], costs[far] = 0.0, torch.inf
         pull, parts = fixed.new_full((B,), FIRST), []
@@ -373,9 +383,9 @@ class SequentialQP(nn.Module):
                 solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
             solved, among = solution.solved, torch.arange(len(todo))
             own = [getattr(solution, name) for name in PARTS]
-            parts = parts or [x.clone() for x in own]
-            for part, x in zip(parts, own, strict=True):
+            for part, x in zip(parts, own, strict=False):  # none at first
                 part[todo[solved]] = x[solved]
+            parts = parts or own
             lam = torch.where(hard[todo] & solved.unsqueeze(1), PRICE * solution.lam.abs(), 0)
             price[todo] = price[todo].maximum(lam)
             box = solution.z[:, layout.n_preview :]  # the entries of G's first rows
@@ -383,23 +393,23 @@ class SequentialQP(nn.Module):
             box = F.pad(box.clamp(low, high).where(firm, box), (layout.n_preview, 0))
             step = (layout.predicted(box)[1] - u[todo]) * solved[:, None, None]
             tries = torch.stack([u[todo] + share * step for share in FRACTIONS], 1)
-            found = self.simulated(p[todo].unsqueeze(1), tries)
-            before = merit(todo, z[todo].unsqueeze(1), costs[todo].unsqueeze(1))[:, 0]
-            after, best = merit(todo, *found).min(1)
-            scale = before.abs() + (z[todo] * times(near.H, z[todo])).sum(-1)
+            found = rated(todo, *self.simulated(p[todo].unsqueeze(1), tries))
+            before = merit(price, costs, over)[todo]
+            after, best = merit(price[todo, None], *found[1:]).min(1)
+            force, change = times(near.H, z[todo]), solution.z - z[todo]
+            scale = before.abs() + (z[todo] * force).sum(-1)
             better = solved & after.isfinite() & (after <= before + ROUNDING * scale)
             small = (step.abs().amax(1) <= SETTLED * u[todo].abs().amax(1)).all(1)
-            change = solution.z - z[todo]
-            forces = times(near.H, change), ROUNDING * (times(near.H, z[todo]) + near.q)
+            forces = times(near.H, change), ROUNDING * (force + near.q)
             small |= ((torch.stack(forces) * change).sum(-1).abs() <= ROUNDING**2 * scale).all(0)
-            for own, new in zip((u, z, costs), (tries, *found), strict=True):
+            for own, new in zip((u, z, costs, over), (tries, *found), strict=True):
                 own[todo[better]] = new[among, best][better]
             converged[todo] = solved & small & (pull[todo] <= 1) & before.isfinite()
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
             done[todo] = converged[todo] | (pull[todo] > MOST)
         left = (~converged & (parts[5] == 0)).nonzero().squeeze(1)  # the plan in place of the QP's
-        parts[0][left] = merit(left, z[left].unsqueeze(1), costs[left].unsqueeze(1))[:, 0]
+        parts[0][left] = merit(price, costs, over)[left]
         parts[1][left] = z[left]
         parts[5][left[parts[0][left].isinf()]] = int(Status.INVALID_DATA)
         y = times(qp.G, parts[1])
@@ -441,35 +451,37 @@ def _jacobian(f: Any, w: Tensor, size: int, graph: bool = False) -> tuple[Tensor
     return (out[0] if graph else out[0].detach()), J.movedim(0, -2)
 
 
-def of_networks(model: LearnedModel, w: Tensor) -> tuple[Tensor, Tensor]:
+def of_networks(model: LearnedModel, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return what automatic differentiation of a model does, in a fraction of its time.
 
-    They are the Jacobian ``(R, m, n)`` of its change of x, and of its l if there is one, at
-    w = [d; x; u] ``(R, n)``, and the Hessian ``(R, n, n)`` of the last of these entries.
+    They are its change of x, and its l if there is one, ``(R, m)`` at w = [d; x; u] ``(R, n)``,
+    their Jacobian ``(R, m, n)``, and the Hessian ``(R, n, n)`` of the last of these entries.
     """
     v, R, n, m = (w - model.middle) / model.size, *w.shape, model.base.shape[1]
     J, hessian = model.base[1 : 1 + n].mT.expand(R, m, n), w.new_zeros(n, n)
-    if len(model.base) > 1 + n:
+    if model.base[1 + n :].any():
         rows, columns = torch.triu_indices(n, n)
         products = w.new_zeros(m, n, n)
         products[:, rows, columns] = model.base[1 + n :].mT
         products = products + products.mT
         J, hessian = J + (products @ v.mT).movedim(-1, 0), products[-1]
+    out = model.base[0] + times(J + model.base[1 : 1 + n].mT, v) / 2
     if model.depth:
-        W_1, b_1, W_2, b_2, W_3, _ = (getattr(model, f"layer_{i}") for i in range(model.depth))
-        K = len(W_2)
+        W_1, b_1, W_2, b_2, W_3, b_3 = (getattr(model, f"layer_{i}") for i in range(model.depth))
+        size = W_2.shape[:2]  # of the networks' hidden units
         one = _silu(torch.addmm(b_1, v, W_1))
-        hidden = one[0].unflatten(1, (K, -1)).movedim(1, 0)
+        hidden = one[0].view(R, *size).movedim(1, 0)
         two = [x.movedim(0, 1).flatten(1) for x in _silu(torch.baddbmm(b_2, hidden, W_2))]
-        inner = (W_1 * one[1].unsqueeze(1)).view(R * n, K, -1).movedim(1, 0).bmm(W_2)
-        inner = inner.movedim(0, 1).reshape(R, n, -1)
+        out = out + torch.addmm(b_3, two[0], W_3)
+        inner = (W_1 * one[1].unsqueeze(1)).view(R * n, *size).movedim(1, 0).bmm(W_2)
+        inner = inner.movedim(0, 1).reshape(R, n, len(b_1))
         J = J + ((inner * two[1].unsqueeze(1)).flatten(0, 1) @ W_3).view(R, n, m).mT
         first, second = (x * W_3[:, -1] for x in two[1:])
         hessian = hessian + (inner * second.unsqueeze(1)) @ inner.mT
-        first = first.view(R, K, -1).movedim(1, 0).bmm(W_2.mT).movedim(0, 1).flatten(1)
+        first = first.view(R, *size).movedim(1, 0).bmm(W_2.mT).movedim(0, 1).flatten(1)
         hessian = hessian + (W_1 * (first * one[2]).unsqueeze(1)) @ W_1.mT
     J, hessian = J / model.size, hessian / model.size / model.size.unsqueeze(-1)
-    return J, hessian.expand(R, n, n)
+    return out, J, hessian.expand(R, n, n)
 
 
 def _silu(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
