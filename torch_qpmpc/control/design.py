@@ -118,18 +118,16 @@ class Design:
             example = f"Q={{{y!r}: 1.0}}, dR={{{u!r}: 0.1}}"
             remedy = f"Pass one, such as {example}: (y - r)'Q(y - r) + u'R u + du'dR du."
             raise QPError.expected("Q", "no cost", "weights of the outputs", remedy)
-        inputs = self.plant.inputs
-        own = [*map(self.levels.get, inputs)]
-        bounds = hull("u_bounds", self.u_bounds, own, inputs, self.du_bounds)
+        own = [*map(self.levels.get, self.plant.inputs)]
+        bounds = hull("u_bounds", self.u_bounds, own, self.plant.inputs, self.du_bounds)
         object.__setattr__(self, "u_bounds", bounds)
         if not np.isfinite(self.resting).all():
             raise QPError.expected("u_target", f"{self.resting.tolist()}", "finite numbers")
         if (self.y_bounds[0] + self.margins[0] > self.y_bounds[1] - self.margins[1]).any():
             got = f"{self.violation}, which leaves no room between the bounds"
             raise QPError.expected("violation", got, "larger shares, or wider y_bounds")
-        if (self.slack < 0).any():
-            want = "prices >= 0, or inf for hard rows"
-            raise QPError.expected("y_slack", f"{self.y_slack}", want)
+        if any(price < 0 for price in self.y_slack.values()):
+            raise QPError.expected("y_slack", self.y_slack, "prices >= 0, or inf for hard rows")
 
     def __str__(self) -> str:
         plant, weights = self.plant, {"Q": self.Q, "R": self.R, "dR": self.dR}

@@ -28,6 +28,7 @@ from torch_qpmpc.control.observer import (
 )
 from torch_qpmpc.control.state_space import Array, by_name, read_table
 from torch_qpmpc.errors import QPError, SolverError
+from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.nonlinear import SequentialQP
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution
 from torch_qpmpc.qp.pipeline.solve import AtRest
@@ -289,6 +290,7 @@ class Law:
         """Return the dynamics of the plan's state, which is relative to the target."""
         design, model = self.design, self.mpc.plan.scheme.model
         n, place, f = len(design.plant.A), design.places["known"], design.plant.dynamics
+        f = f.folded() if isinstance(f, LearnedModel) else f
         x_s, u_s = (torch.from_numpy(np.atleast_2d(part)[-1]) for part in target[:2])
         d_s = torch.from_numpy(np.where(design.acts, known[-1], design.nominal))
         load, (A, B) = torch.from_numpy(self.loads @ w), (x[n:].mT for x in (model.A, model.B))
