@@ -79,16 +79,6 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
 
 
-def test_files_of_the_first_format_are_read_but_for_theta_of_another_cost(tmp_path):
-    with pytest.raises(QPError, match=r"^path: got .*learned another cost, expected .* version 2"):
-        qm.Controller.load(FOLDER / "saved-1.qpmpc")
-    controller = qm.Controller(qm.LinearMPC((A, B, C), 5, Q=1.0, dR=1.0, u_bounds=(-1.0, 1.0)))
-    controller.save(tmp_path / "plain")
-    torch.save({**torch.load(tmp_path / "plain"), "version": 1}, tmp_path / "plain")
-    twin = qm.Controller.load(tmp_path / "plain")
-    assert twin.step([1.0], [0.0]) == controller.step([1.0], [0.0])
-
-
 def test_later_releases_read_the_format():
     """``python -m tests.control.test_saving`` has written the file."""
     controller = qm.Controller.load(FOLDER / "saved-2.qpmpc")

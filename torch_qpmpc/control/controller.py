@@ -245,8 +245,8 @@ class Controller:
         """Return the controller that `save` wrote to ``path``; it goes on where that one was.
 
         Raises:
-            QPError: the file is missing or damaged, of another kind or a newer release, has theta
-                of another cost, or holds more than tensors and plain values.
+            QPError: the file is missing or damaged, of another kind or release, or holds more than
+                tensors and plain values.
         """
         return restored(path, load_file(path, KIND), cls._of_stored)
 

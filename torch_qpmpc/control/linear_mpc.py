@@ -26,7 +26,7 @@ from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import aimed, lowered, target_mpc
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import VERSION, damaged, load_file, save_file
+from torch_qpmpc.files import damaged, load_file, save_file
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
@@ -217,7 +217,7 @@ class LinearMPC:
         """Return the LinearMPC that `save` wrote to ``path``, with all of theta.
 
         Raises:
-            QPError: as in `QPMPC.load`, or the file has no design, or theta of another cost.
+            QPError: as in `QPMPC.load`, or the file has no design.
         """
         content = load_file(path, KIND, "LinearMPC.save")
         if "design" not in content:
@@ -319,10 +319,7 @@ def _expanded(
 
 
 def restored(path: str | Path, content: Mapping[str, Any], of: Callable[[Any], Any]) -> Any:
-    """Return what ``of`` makes of a file's content; `QPError` if it has theta of another cost."""
-    if content["version"] < VERSION and content["arguments"]["learn"]:
-        got, want = f"{path}, whose plan has learned another cost", f"a file of version {VERSION}"
-        raise QPError.expected("path", got, want, "Learn again: its design and log go on.")
+    """Return what ``of`` makes of a file's content; raise `QPError` if it is damaged."""
     try:
         return of(content)
     except Exception as error:  # damaged files raise errors of any type

@@ -507,7 +507,7 @@ class QPMPC(nn.Module):
         """Return the QPMPC that `save` wrote to ``path``, on the CPU, with all of theta.
 
         Raises:
-            QPError: the file is missing, damaged, of another kind or of a newer release.
+            QPError: the file is missing, damaged, of another kind or of another release.
 
         Example:
             >>> import tempfile, torch_qpmpc as qm
