@@ -144,7 +144,6 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("mpc: got QPActorValueOperator, expected a QPMPC. Pass the QPMPC", lambda: qm.GaussNewton(op)),
     ("rates: got list, expected a mapping such as {'cost': .., 'constraints':", G(scales=[1.0])),
     ("scales[H]: got 0.0, expected a finite number >", G(scales={"cost": 0.0, "constraints": 0.0})),
-    ("trust_region: got 'no', expected True or False.", G(trust_region="no")),
     ("target: got shape (), expected shape (4,). Squeeze its", lambda: gn.step(S, Aa, tensor(0.0))),
     ("weighted: got 'yes', expected True or False.", lambda: Loss(weighted="yes")),
     (

@@ -42,7 +42,7 @@ UNITS = {
 }
 
 
-@pytest.mark.parametrize("options", [{}, {"trust_region": False, "lr": 0.5}])
+@pytest.mark.parametrize("options", [{}, {"lr": 0.5}])
 @pytest.mark.parametrize("name", UNITS)
 def test_a_qp_learns_alike_in_any_units(name, options):
     states, u, d, cost, learn = UNITS[name]
@@ -74,7 +74,7 @@ def test_a_part_moves_no_more_freely_as_its_gradients_vanish():
     s, a = random_states(COUNT, 2, size=0.9), random_states(COUNT, 1, size=0.45, seed=1)
     for steps in (0, 3):
         mpc = random_mpc(2, free=0.0, learn=("c", "C"))
-        optimizer = GaussNewton(mpc, trust_region=False)
+        optimizer = GaussNewton(mpc)
         for _ in range(steps):
             optimizer.step(s, a, mpc.action_value(s, a).detach())
         C = mpc.C.detach().clone()

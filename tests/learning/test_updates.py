@@ -64,7 +64,7 @@ def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, option
     twin, loss = copy.deepcopy(mpc), make_loss(mpc, **options)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     before, batch = mpc.C.detach().clone(), transitions(20)
-    optimizer = GaussNewton(mpc, trust_region=False)
+    optimizer = GaussNewton(mpc, damping=10.0)
     update = second_order(mpc, loss, optimizer, Penalties(si=si if with_si else None))
     if "weights" in step:
         batch["priority_weight"] = step["weights"]
@@ -78,7 +78,7 @@ def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, option
         target = make_loss(twin).target(transitions(20))
         s, a = batch["observation"], batch["action"]
         penalty = si.curvature(windows) if with_si else None
-        GaussNewton(twin, trust_region=False).step(s, a, -target, penalty=penalty, **step)
+        GaussNewton(twin, damping=10.0).step(s, a, -target, penalty=penalty, **step)
     assert_close(mpc.state_dict(), twin.state_dict(), rtol=1e-9, atol=1e-12)
     assert (mpc.C - before).abs().max() > 1e-4
 
@@ -118,7 +118,7 @@ def test_invalid_rewards_are_counted_under_their_own_name(second):
     batch["action"][2] = 9.0  # beyond a hard bound
     batch["next", "reward"][4] = torch.nan
     if second:
-        optimizer = GaussNewton(mpc, trust_region=False)
+        optimizer = GaussNewton(mpc, damping=10.0)
         update = second_order(mpc, loss, optimizer, Penalties())
     else:
         update = first_order(mpc, loss, torch.optim.SGD(mpc.parameters(), 1e-3), Penalties())

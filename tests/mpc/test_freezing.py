@@ -62,7 +62,7 @@ def test_a_gauss_newton_step_is_that_in_the_learned_entries_alone(kind):
     mask = MASKS[kind]()
     mpc = masked(mask)
     s, a, target = targets(mpc)
-    optimizer = GaussNewton(mpc, damping=0.1, trust_region=False)
+    optimizer = GaussNewton(mpc, damping=0.1)
     reference = Reference(mpc, optimizer)
     before, expected = reference.theta(), reference.step(s, a, target)
     C = mpc.C.detach().clone()

@@ -215,11 +215,9 @@ def test_gauss_newton_judges_the_projected_step(name):
     def squares(change: Tensor) -> float:
         return (old.detach() + change - target).square().sum().item()
 
-    before, target, plain = theta(), old.detach() - 0.5 * normal(5).abs(), copy.deepcopy(mpc)
-    GaussNewton(plain, damping=0.1, trust_region=False).step(s, a, target)
+    before, target = theta(), old.detach() - 0.5 * normal(5).abs()
     report = GaussNewton(mpc, damping=0.1).step(s, a, target)
     assert report.accepted
-    assert_close(mpc.state_dict(), plain.state_dict(), rtol=0, atol=0)
     assert torch.linalg.eigvalsh(mpc.quadratic_program().H)[0] < 1e-9, "it was projected"
     start, actual = squares(torch.zeros(5)), mpc.action_value(s, a).detach() - old.detach()
     gain = start - squares(rows @ (theta() - before))

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import POSITIVE, check_flag, check_kind, check_number, check_tensor
+from torch_qpmpc.checks import POSITIVE, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.kernel import (
     FRESH,
@@ -52,7 +52,7 @@ class StepReport:
 
     Attributes:
         damping: mu as a fraction of the mean of K's diagonal, as used by the step.
-        ratio: actual over predicted decrease of the objective; nan without a trust region.
+        ratio: actual over predicted decrease of the objective; nan without a step.
         accepted: True if theta has moved.
         usable: True for pairs with a solution and a finite target, ``(B,)``.
         solution: the solution of Q(s, a) before the step.
@@ -68,6 +68,10 @@ class StepReport:
 class GaussNewton(torch.optim.Optimizer):
     """A Levenberg-Marquardt optimiser of the learned parts of a `QPMPC`.
 
+    It solves the batch again after each step and its projection, undoes one that raised the squared
+    errors or left a QP unsolved, and adapts the damping to actual over predicted decrease. Five
+    steps undone in a row are a `RuntimeWarning`.
+
     ``lr``, the fraction of each step that is taken, follows torch's schedulers. Of a part with a
     mask in the QPMPC's ``learn`` it moves the entries that are learned.
 
@@ -77,11 +81,8 @@ class GaussNewton(torch.optim.Optimizer):
             ``"cost"`` and of the ``"constraints"``, as in `QPMPC.parameter_groups`. They have no
             unit, and only their ratios matter; by default 1 and 3.
         lr: the initial fraction, in (0, 1].
-        damping: mu as a fraction of the mean of K's diagonal, and the trust region's lower bound
-            on it. A larger one makes a step less sensitive to its batch's noise.
-        trust_region: solve the batch again after each step and its projection; undo a step that
-            raised the squared errors or left a QP unsolved, and adapt the damping to actual over
-            predicted decrease. Five of them in a row are a `RuntimeWarning`.
+        damping: mu as a fraction of the mean of K's diagonal, and the lower bound on it. A larger
+            one makes a step less sensitive to its batch's noise.
 
     Raises:
         QPError: if a number is out of range, or the scales do not fit the learned parts.
@@ -106,19 +107,17 @@ class GaussNewton(torch.optim.Optimizer):
         scales: Mapping[str, float] | None = None,
         lr: float = 1.0,
         damping: float = 0.03,
-        trust_region: bool = True,
     ) -> None:
         remedy = "Pass the QPMPC itself: its learned parts are the parameters."
         check_kind("mpc", mpc, QPMPC, remedy)
         check_number("lr", lr, lambda x: 0 < x <= 1, "a number in (0, 1]")
         check_number("damping", damping, *POSITIVE)
-        check_flag("trust_region", trust_region)
         groups = mpc.parameter_groups(scales or {"cost": 1.0, "constraints": 3.0})
         for group in groups:
             check_number(f"scales[{group['name']}]", group["lr"], *POSITIVE)
             group |= {"scale": group["lr"], "lr": lr, "damping": damping, **FRESH}
         super().__init__(groups, {})
-        self._mpc, self._least_damping, self._trust_region = mpc, damping, trust_region
+        self._mpc, self._least_damping = mpc, damping
 
     @without_gradients
     def step(  # pyright: ignore[reportIncompatibleMethodOverride] - not a closure
@@ -161,7 +160,7 @@ class GaussNewton(torch.optim.Optimizer):
         check_tensor("weights", weights, len(s), batched=False)
         if clip is not None:
             check_number("clip", clip, *POSITIVE)
-        lr, damping = (self.param_groups[0][name] for name in ("lr", "damping"))
+        damping = self.param_groups[0]["damping"]
         with torch.enable_grad():
             qp = self._mpc.quadratic_program()
         solution = self._mpc.solve(s, a, warm_start, qp)
@@ -193,10 +192,6 @@ class GaussNewton(torch.optim.Optimizer):
             for group in self.param_groups:
                 group |= FRESH
             return report(math.nan, False)
-        if not self._trust_region:
-            _move(blocks, steps, lr)
-            self._mpc.project_()
-            return report(math.nan, True)
         old = [block.leaf.clone() for block in blocks]
         ratio = self._try(blocks, steps, delta, change, (s, a, root, solution))
         accepted = ratio > 0  # False for nan, which an infinite cost causes
