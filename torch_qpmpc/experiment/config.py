@@ -149,7 +149,7 @@ class FromData(Group):
 
 
 def _installed_logger(name: str) -> str:
-    if name in ("wandb", "mlflow") and importlib.util.find_spec(name) is None:
+    if name == "wandb" and importlib.util.find_spec(name) is None:
         got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
         raise QPError.expected("logger", got, "an installed logger", remedy)
     return name
@@ -200,9 +200,7 @@ class Config(Group):
     gate: Literal["act", "plant"] | bool
     gate_bound: Positive | None
     gate_interval: Count | None
-    logger: Annotated[
-        Literal["tensorboard", "csv", "wandb", "mlflow"], AfterValidator(_installed_logger)
-    ]
+    logger: Annotated[Literal["tensorboard", "csv", "wandb"], AfterValidator(_installed_logger)]
     figures: bool
     rivals: bool | list[str]
     eval_interval: Count

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -55,10 +54,6 @@ class RunFolder:
             self.flush()
         finally:
             self.logger.close()
-            if self.cfg.logger == "mlflow":
-                import mlflow  # pyright: ignore[reportMissingImports] - an extra
-
-                mlflow.end_run()  # which the logger does not
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
         """Log scalars at an update, to metrics.csv and the logger."""
@@ -91,10 +86,7 @@ class RunFolder:
 def make_logger(cfg: Config, folder: Path) -> Logger:
     """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
     name = cfg.logger
-    if name == "mlflow":  # its default, a database, needs more packages
-        os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
-    place = folder / "mlflow" if name == "mlflow" else folder
-    logger = get_logger(name, str(place), folder.name if name == "wandb" else name)
+    logger = get_logger(name, str(folder), folder.name if name == "wandb" else name)
     assert logger is not None
     if name != "tensorboard":  # whose hyper-parameters begin a folder of their own
         logger.log_hparams({key: str(value) for key, value in cfg.settings.items()})
