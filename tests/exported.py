@@ -147,7 +147,7 @@ def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[
     """Compile the tables of a QP, without a comparison."""
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.Q) + AT_LEAST
-    chosen = Settings("policy", "float64", "fast", limit)._replace(**settings)
+    chosen = Settings("policy", "float64", limit)._replace(**settings)
     p, u, none = np.zeros((1, tables.n_p)), np.zeros((1, tables.n_u)), np.zeros(1)
     nothing = Examples(["origin"], p, np.zeros(1, int), u, none, none, none, u[0])
     texts, flags = sources(tables, chosen, "", nothing), (*flags, "-std=c99", "-fPIC", "-shared")

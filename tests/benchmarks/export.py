@@ -57,7 +57,7 @@ def pointer(x: np.ndarray) -> ctypes.c_void_p:
 
 def compiled(mpc: QPMPC, folder: Path) -> Callable[[np.ndarray, bool], Times]:
     """Return a function that times the exported C at p ``(steps, n_p)``, warm or cold."""
-    export = export_c(mpc, folder, storage="fast")
+    export = export_c(mpc, folder)
     timed = library(folder, HERE / "timing.c", str(folder / "policy.c"))
     assert export.state_bytes is not None  # there is a compiler
     state = np.zeros(export.state_bytes // 8 + 8)

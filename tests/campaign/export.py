@@ -38,12 +38,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.campaign.export", description=__doc__)
     parser.add_argument("--count", type=int, default=100_000, help="states per problem")
     parser.add_argument("--problem", choices=tuple(PROBLEMS), help="one problem; all by default")
-    parser.add_argument("--storage", choices=("fast", "small"), default="fast")
     parser.add_argument("--write", action="store_true", help="write the table's rows into the docs")
     options = parser.parse_args(arguments)
     wrong = 0
     for name in [options.problem] if options.problem else PROBLEMS:
-        row, good = judged(name, options.count, options.storage)
+        row, good = judged(name, options.count)
         print(" | ".join(row), "" if good else "WRONG", flush=True)
         wrong += not good
         if options.write:
@@ -51,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
     return wrong
 
 
-def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
+def judged(name: str, count: int) -> tuple[list[str], bool]:
     """Return the table's row of a problem, and True if no answer is wrong."""
     mpc, known, _ = PROBLEMS[name]()
     rng = np.random.default_rng(0)
@@ -59,7 +58,7 @@ def judged(name: str, count: int, storage: str) -> tuple[list[str], bool]:
     p[: count // 10] *= 10
     p = rng.permutation(p)
     with tempfile.TemporaryDirectory() as folder:
-        export = export_c(mpc, folder, storage=storage)
+        export = export_c(mpc, folder)
         library = read(Path(folder))
         size = object_size(Path(folder))
     counts, wrong, worst = np.zeros(3, dtype=int), 0, np.zeros(2)

@@ -209,7 +209,7 @@ def test_the_header_names_signals_and_the_report_has_the_size_of_the_state(tmp_p
 
 def test_single_precision_agrees_to_its_accuracy(tmp_path):
     controller = qm.Controller(integrator(y_bounds=None))
-    report = controller.export_c(tmp_path, dtype="float32", storage="small")
+    report = controller.export_c(tmp_path, dtype="float32")
     twin = load(report.files, controller, dtype="float32")
     difference, counts = soak(controller, twin, STEPS, 0, 3, faults=0.0)
     assert difference < 1e-3

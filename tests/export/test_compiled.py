@@ -21,7 +21,7 @@ needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C com
 @needs_compiler
 def test_actions_and_values_are_those_of_the_module():
     mpc = tied()
-    policy = CompiledPolicy(mpc, storage="small")
+    policy = CompiledPolicy(mpc)
     s = torch.linspace(-1, 1, 12).reshape(2, 3, 2)
     assert policy(s).shape == (2, 3, 1)
     assert policy(s).dtype is torch.float32

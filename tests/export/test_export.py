@@ -24,10 +24,9 @@ needs_compiler = pytest.mark.skipif(compiler() is None, reason="no C compiler")
 
 
 @needs_compiler
-@pytest.mark.parametrize("options", [{}, {"storage": "small"}], ids=["fast", "small"])
-def test_the_report_has_sizes_and_agreement(options, tmp_path):
+def test_the_report_has_sizes_and_agreement(tmp_path):
     mpc = SCHEMES["point mass"]()
-    export = export_c(mpc, tmp_path / "deep" / "folder", name="mass", **options)
+    export = export_c(mpc, tmp_path / "deep" / "folder", name="mass")
     assert [file.name for file in export.files] == ["mass.h", "mass.c"]
     assert all(file.exists() for file in export.files)
     assert (export.n_p, export.n_u, export.rows, export.variables) == (4, 2, 60, 20)
@@ -42,13 +41,6 @@ def test_the_report_has_sizes_and_agreement(options, tmp_path):
     assert export.state_bytes == read(tmp_path / "deep/folder", "mass").state_bytes
     assert f"state {export.state_bytes:,} bytes" in str(export)
     assert "at 40 states: actions within" in str(export)
-
-
-@needs_compiler
-def test_small_is_smaller_where_rows_outnumber_variables(tmp_path):
-    mpc = SCHEMES["12 states"]()
-    sizes = [export_c(mpc, tmp_path, storage=x).table_bytes for x in ("fast", "small")]
-    assert sizes[1] < 0.8 * sizes[0]
 
 
 @needs_compiler
@@ -105,7 +97,6 @@ def test_previews_are_in_the_head(tmp_path):
 
 @refused(
     ({"dtype": "float16"}, "dtype: got 'float16', expected one of float64, float32"),
-    ({"storage": "tiny"}, "storage: got 'tiny', expected one of fast, small"),
     ({"name": "2nd"}, "name: got '2nd', expected a C identifier. It begins the names"),
     ({"name": 3}, "name: got 3, expected a C identifier"),
     ({"name": "Math"}, "name: got 'Math', whose .h is a standard header, expected another"),
@@ -318,7 +309,7 @@ def test_the_self_test_fails_for_other_tables(tmp_path):
 @needs_compiler
 def test_two_policies_link_into_one_program(tmp_path):
     export_c(tied(), tmp_path, name="one")
-    export_c(rates(), tmp_path, name="two", storage="small")
+    export_c(rates(), tmp_path, name="two")
     main = '#include "one.h"\n#include "two.h"\nint main(void)\n'
     main += "{ return one_selftest() + two_selftest(); }\n"
     (tmp_path / "main.c").write_text(main)

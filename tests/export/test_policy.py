@@ -1,6 +1,5 @@
 """The exported C: solutions, codes, limits, and what compilers say."""
 
-import itertools
 import subprocess
 
 import numpy as np
@@ -52,16 +51,14 @@ def check(mpc, count=200, seed=0, **settings):
     return cold, codes
 
 
-@pytest.mark.parametrize(
-    ("name", "storage"), [*zip(SCHEMES, itertools.cycle(("fast", "small")), strict=False)]
-)
-def test_a_scheme_agrees_with_an_exact_solver(name, storage):
-    check(SCHEMES[name](), storage=storage)
+@pytest.mark.parametrize("name", SCHEMES)
+def test_a_scheme_agrees_with_an_exact_solver(name):
+    check(SCHEMES[name]())
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_rows_of_every_kind_agree_with_an_exact_solver(seed):
-    check(random_qp(seed), 150, storage=("fast", "small")[seed % 2])
+    check(random_qp(seed), 150)
 
 
 def test_hard_rows_that_no_plan_satisfies_are_infeasible():
@@ -217,10 +214,9 @@ def test_compilers_agree_without_a_warning(name, level, exported):
 
 
 def test_sanitizers_find_nothing(tmp_path):
-    """Those of a controller's C, in tests/control/test_bad_hours.py, see the other storage."""
     levels = {"action_levels": [(-1.0, 0.2, 1.0)], "min_on": 2, "start_cost": 0.1}
     mpc = tied(4, **levels)
-    export_c(mpc, tmp_path, storage="small")
+    export_c(mpc, tmp_path)
     (tmp_path / "p.bin").write_bytes(draw_known(mpc, 40).tobytes())
     flags = (*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     try:

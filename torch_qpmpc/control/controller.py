@@ -382,11 +382,11 @@ class Controller:
         input and the active sets of all QPs in the state. With a C compiler, a closed loop is
         compared with this controller's.
 
-        The ``options`` are ``dtype``, ``max_iterations`` and ``storage`` of `export_c`, and
-        ``missing``, True for a plant whose outputs are often missing: the C code then carries the
-        covariance of the n_e estimates, as `step` does, with n_e^2 more numbers of state, tables of
-        twice as many, and about 4 n_e^3 operations. Otherwise the steady gains stay. The report has
-        sizes and the measured agreement.
+        The ``options`` are ``dtype`` and ``max_iterations`` of `export_c`, and ``missing``, True
+        for a plant whose outputs are often missing: the C code then carries the covariance of the
+        n_e estimates, as `step` does, with n_e^2 more numbers of state, tables of twice as many,
+        and about 4 n_e^3 operations. Otherwise the steady gains stay. The report has sizes and the
+        measured agreement.
 
         Raises:
             QPError: as in `export_c`, or the self-test fails.
@@ -403,8 +403,8 @@ class Controller:
         are ``u.q`` and ``status``. While ``manual`` is true, it records ``applied.q`` as `observe`
         does. ``last.q`` is the input before the start, and with ``rests`` it starts as by
         ``reset(y, u, known)``. ``lower.q`` and ``upper.q`` are bounds. A step takes the model's dt,
-        or a second. ``name`` is the model's identifier; the options are ``max_iterations`` and
-        ``storage`` of `export_c`, whose report it returns for ``path``.
+        or a second. ``name`` is the model's identifier; the option is ``max_iterations`` of
+        `export_c`, whose report it returns for ``path``.
 
         Raises:
             QPError: no C compiler is installed, or as in `export_c`.

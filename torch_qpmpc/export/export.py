@@ -39,7 +39,7 @@ class Export:
 
     Attributes:
         files: the paths of ``name.h`` and ``name.c``.
-        dtype, storage, max_iterations: as in `export_c`.
+        dtype, max_iterations: as in `export_c`.
         n_p, n_u: the numbers of entries of p and u.
         rows: the number of rows with multipliers.
         variables: the number of free variables of a plan.
@@ -60,7 +60,6 @@ class Export:
 
     files: tuple[Path, ...]
     dtype: str
-    storage: str
     max_iterations: int
     n_p: int
     n_u: int
@@ -77,7 +76,7 @@ class Export:
         lines = [
             f"{', '.join(str(file) for file in self.files)}",
             f"{self.n_p} known entries, {self.n_u} actions, {self.rows} rows, "
-            f"{self.variables} variables; {self.dtype}, {self.storage}",
+            f"{self.variables} variables; {self.dtype}",
             f"tables {self.table_bytes:,} bytes; condition {self.condition:.1e}",
             "not compared with a solver: no C compiler was found",
         ]
@@ -98,7 +97,6 @@ def export_c(
     dtype: str = "float64",
     name: str = "policy",
     max_iterations: int | None = None,
-    storage: str = "fast",
 ) -> Export:
     """Write the policy and value of the current theta as C99 without heap or dependencies.
 
@@ -111,8 +109,6 @@ def export_c(
         dtype: ``"float64"`` or ``"float32"``, the type of all numbers in C.
         name: the beginning of the names of files and functions.
         max_iterations: the limit of a step; by default 20 per row of G on the plan, plus 100.
-        storage: ``"fast"`` stores a table of rows by rows; ``"small"`` one of rows by free
-            variables if that is smaller.
 
     Returns:
         Sizes, conditioning, and the measured agreement.
@@ -121,13 +117,13 @@ def export_c(
         QPError: an argument is invalid, the cost is singular on the plan, no state has a solution,
             or the self-test fails.
     """
-    export, texts, _ = build(mpc, Settings(name, dtype, storage, max_iterations))
+    export, texts, _ = build(mpc, Settings(name, dtype, max_iterations))
     return replace(export, files=written(folder, texts))
 
 
 def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Library | None]:
     """Return a report without files, the texts by file name, and the functions with a compiler."""
-    name, dtype, storage, limit = settings
+    name, dtype, limit = settings
     _check(mpc, settings)
     tables = make_tables(mpc)
     settings = settings._replace(max_iterations=limit or PER_ROW * len(tables.Q) + AT_LEAST)
@@ -160,7 +156,6 @@ def build(mpc: QPMPC, settings: Settings) -> tuple[Export, dict[str, str], Libra
     export = Export(
         files=(),
         dtype=dtype,
-        storage=storage,
         max_iterations=settings.max_iterations or 0,
         state_bytes=None if library is None else library.state_bytes,
         condition=tables.condition,
@@ -185,7 +180,6 @@ def _check(mpc: QPMPC, settings: Settings) -> None:
     if (check_linear := getattr(mpc, "check_linear", None)) is not None:  # a `LinearMPC.plan`
         check_linear("C and FMUs")
     check_choice("dtype", settings.dtype, tuple(REAL))
-    check_choice("storage", settings.storage, ("fast", "small"))
     check_name(settings.name)
     if settings.max_iterations is not None:
         check_whole("max_iterations", settings.max_iterations, 1)
@@ -210,7 +204,7 @@ class CompiledPolicy:
     Args:
         mpc: the QPMPC. With its ``on_failure="raise"`` a step that is not solved raises; otherwise
             the policy returns the action that C writes.
-        dtype, storage, max_iterations: as in `export_c`.
+        dtype, max_iterations: as in `export_c`.
 
     Attributes:
         export: sizes and measured agreement, an `Export`.
@@ -233,11 +227,10 @@ class CompiledPolicy:
         mpc: QPMPC,
         *,
         dtype: str = "float64",
-        storage: str = "fast",
         max_iterations: int | None = None,
     ) -> None:
         required_compiler()
-        self.export, _, library = build(mpc, Settings("policy", dtype, storage, max_iterations))
+        self.export, _, library = build(mpc, Settings("policy", dtype, max_iterations))
         assert library is not None
         self._library = library
         self._n_p, self._n_u, self._raises = mpc.n_p, mpc.n_u, mpc.on_failure == "raise"

@@ -50,7 +50,6 @@ def export_fmu(
     *,
     name: str = "policy",
     max_iterations: int | None = None,
-    storage: str = "fast",
 ) -> Export:
     """Write the policy of the current theta as an FMU of FMI 3.0 for co-simulation.
 
@@ -59,7 +58,7 @@ def export_fmu(
     second. The FMU has the sources of `export_c` and a library for this machine.
 
     Args:
-        mpc, max_iterations, storage: as in `export_c`.
+        mpc, max_iterations: as in `export_c`.
         path: the file, such as ``policy.fmu``.
         name: the model's identifier.
 
@@ -88,7 +87,7 @@ def export_fmu(
         Variable("u.lower", "constant", tables.u_lower, "bounds of u"),
         Variable("u.upper", "constant", tables.u_upper, "bounds of u"),
     ]
-    report, texts, _ = build(mpc, Settings(name, "float64", storage, max_iterations))
+    report, texts, _ = build(mpc, Settings(name, "float64", max_iterations))
     return replace(report, files=(write_fmu(path, name, texts, variables),))
 
 

@@ -51,26 +51,6 @@ static void add(real *a, real factor, const real *b, int n)
     for (i = 0; i < n; i++) a[i] += factor * b[i];
 }
 
-#if POLICY_FACTORED /* the table is R with Q = R R' */
-
-static real entry(int i, int j) { return dot(R[i], R[j], POLICY_D); }
-
-/* Update y to the multipliers that have changed since the last call. */
-static void respond(policy_state *s)
-{
-    real *plan = s->work + 2 * POLICY_HELD_;
-    int i;
-    for (i = 0; i < POLICY_D; i++) plan[i] = 0;
-    for (i = 0; i < POLICY_ROWS; i++) {
-        if (s->lambda[i] == s->before[i]) continue;
-        add(plan, s->lambda[i] - s->before[i], R[i], POLICY_D);
-        s->before[i] = s->lambda[i];
-    }
-    for (i = 0; i < POLICY_ROWS; i++) s->y[i] -= dot(R[i], plan, POLICY_D);
-}
-
-#else
-
 static real entry(int i, int j) { return Q[i][j]; }
 
 /* Update y to the multipliers that have changed since the last call. */
@@ -83,8 +63,6 @@ static void respond(policy_state *s)
         s->before[i] = s->lambda[i];
     }
 }
-
-#endif
 
 /* Compute y from all multipliers. */
 static void respond_anew(policy_state *s)

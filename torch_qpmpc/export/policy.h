@@ -28,7 +28,7 @@ typedef struct {
     policy_real y[POLICY_ROWS_];               /* rows with the multipliers before[] */
     policy_real before[POLICY_ROWS_];
     policy_real size[POLICY_ROWS_];            /* size of the terms of a row */
-    policy_real work[2 * POLICY_HELD_ + POLICY_WORK];
+    policy_real work[2 * POLICY_HELD_];
     int held[POLICY_HELD_];                    /* rows held at a bound, in the order of the factor */
     int n_held;
     signed char kind[POLICY_ROWS_];            /* see policy.c */

@@ -62,7 +62,6 @@ class Settings(NamedTuple):
 
     name: str
     dtype: str = "float64"
-    storage: str = "fast"
     max_iterations: int | None = None
 
 
@@ -73,7 +72,7 @@ def sources(tables: Tables, settings: Settings, header: str, examples: Examples)
         "@REAL@": REAL[settings.dtype],
         "/* @SIZES@ */": "\n".join(
             f"#define {settings.name.upper()}_{key} {size}"
-            for key, size in sizes_of(tables, settings).items()
+            for key, size in sizes_of(tables).items()
         ),
         "/* @TABLES@ */": _tables(tables, settings),
         "/* @LEVELS@ */": filled("levels.c", settings.name) if tables.levels else "",
@@ -129,20 +128,13 @@ def _harmless(line: str) -> str:
     return line
 
 
-def factored(tables: Tables, settings: Settings) -> bool:
-    """Return True if R is stored in place of Q."""
-    return settings.storage == "small" and tables.R.shape[1] < tables.R.shape[0]
-
-
-def sizes_of(tables: Tables, settings: Settings) -> dict[str, int]:
+def sizes_of(tables: Tables) -> dict[str, int]:
     """Return the sizes in the header, by the macro's name without the prefix."""
     r, d = tables.R.shape
     most = min(r, d)  # rows that are held at once
-    small = factored(tables, settings)
     sizes = {"N_P": tables.n_p, "N_U": tables.n_u, "ROWS": r, "ROWS_": max(r, 1)}
-    sizes |= {"KNOWN": len(tables.known.Y), "D": d, "HELD": most, "HELD_": max(most, 1)}
-    sizes |= {"TRIANGLE": max(most * (most + 1) // 2, 1), "FACTORED": int(small)}
-    sizes |= {"WORK": d * small, "LEVELS": 0}
+    sizes |= {"KNOWN": len(tables.known.Y), "HELD": most, "HELD_": max(most, 1)}
+    sizes |= {"TRIANGLE": max(most * (most + 1) // 2, 1), "LEVELS": 0}
     if levels := tables.levels:
         m, S = levels.rows.shape
         sizes |= {"LEVELS": m, "DECIDED": S, "DECISIONS": m * S, "NODES": levels.max_nodes}
@@ -162,7 +154,7 @@ def arrays_of(tables: Tables, settings: Settings) -> dict[str, Array]:
         "W": rows.w,
         "SIZE": rows.size,
         "UNIT": rows.unit,
-        **({"R": tables.R} if factored(tables, settings) else {"Q": tables.Q}),
+        "Q": tables.Q,
         "KNOWN_P": known.Y,
         "KNOWN_LOWER": known.lower,
         "KNOWN_UPPER": known.upper,
