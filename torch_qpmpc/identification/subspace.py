@@ -13,7 +13,7 @@ states. Signals are normalised, so that units decide nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -144,7 +144,7 @@ def held_out_errors(
     total = np.full((*block.shape, trajectories[0].y.shape[1]), np.nan)
     for part, model in enumerate(parts):
         mask = (block >= 0) & (block % PARTS == part)
-        total[mask] = np.concatenate(_errors(model, trajectories, horizon))[mask]
+        total[mask] = np.concatenate(_errors(model, signals(trajectories), horizon))[mask]
     return total
 
 
@@ -173,7 +173,7 @@ def _correlations(
 
     They are in standard errors, ``(last, n_y + n_u, n_y + n_u)``, without the ``settling`` rows.
     """
-    z, errors = [], _errors(model, trajectories, 1)
+    z, errors = [], _errors(model, signals(trajectories), 1)
     data = [np.hstack((e[:, 0], x.u.numpy())) for e, x in zip(errors, trajectories, strict=True)]
     data = [rows[min(settling, len(rows) // 4) :] for rows in data]
     mean = np.nanmean(np.concatenate(data), 0)
@@ -193,7 +193,7 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
     or an input that is logged a row late.
     """
     n_y, n_u, parts = len(model.C), model.B.shape[1], []
-    for errors, one in zip(_errors(model, trajectories, 1), trajectories, strict=True):
+    for errors, one in zip(_errors(model, signals(trajectories), 1), trajectories, strict=True):
         (y, u, _), e = (x.numpy() for x in one), errors[:-1, 0]
         parts.append(np.hstack((e, u[1:], u[:-1], y[:-2], y[1:-1] - e)))
     rows = np.concatenate(parts)
@@ -211,8 +211,11 @@ def explained_by_inputs(model: Innovations, trajectories: Sequence[Trajectory]) 
 
 def visited(model: Innovations, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
     """Return mean ``(n,)`` and covariance ``(n, n)`` of the log's states before their outputs."""
-    pairs = _filtered(model, signals(trajectories))
-    x = np.concatenate([(x @ model.A.T + moved)[:-1] for x, moved in pairs])
+
+    def before(y: Array, *v: Array) -> Array:
+        return model.estimates(y, *v)[:, :-1] @ model.A.T + model.inputs(*v)
+
+    x = np.concatenate(each(model, signals(trajectories), before))
     return x.mean(0), np.cov(x.T, bias=True).reshape(len(model.A), -1)
 
 
@@ -221,9 +224,9 @@ def signals(trajectories: Sequence[Trajectory]) -> list[Signals]:
     return [Signals(x.y.numpy(), np.hstack((x.u.numpy(), x.d.numpy()))) for x in trajectories]
 
 
-def _errors(model: Innovations, trajectories: Sequence[Trajectory], horizon: int) -> list[Array]:
+def _errors(model: Innovations, data: Sequence[Signals], horizon: int) -> list[Array]:
     """Return multi-step errors ``(T, horizon, n_y)`` of each trajectory."""
-    return each(model, signals(trajectories), lambda y, u, d: model.errors(y, u, d, horizon))
+    return each(model, data, lambda y, u, d: model.errors(y, u, d, horizon))
 
 
 def each(model: Innovations, data: Sequence[Signals], of: Callable) -> list[Any]:
@@ -332,32 +335,15 @@ def _sums(
     y = np.concatenate([one.y for one in data])
     sums = np.zeros((2, count, len(HORIZONS), y.shape[1]))
     for part, model in enumerate(models):
-        mine = (block >= 0) & (block % PARTS == part)
-        k = np.flatnonzero(mine.any(1))
-        x, moved = map(np.concatenate, zip(*_filtered(model, data), strict=True))
-        x = x[k]
-        for step in range(1, max(HORIZONS) + 1):
-            x = x @ model.A.T + moved[np.minimum(k + step - 1, len(y) - 1)]
-            if step in HORIZONS:
-                h = HORIZONS.index(step)
-                rows = mine[k, h]
-                after, where = y[k[rows] + step], block[k[rows], h]
-                e, seen = after - x[rows] @ model.C.T, np.isfinite(after)
-                off = np.where(np.abs(e) < WORST, e, WORST) ** 2 * seen  # NaN is WORST
-                for total, weights in zip(sums, (off, seen), strict=True):
-                    for j, column in enumerate(weights.T):
-                        total[:, h, j] += np.bincount(where, column, count)
+        parts = _errors(model, data, max(HORIZONS))
+        errors = np.concatenate([np.pad(e, ((0, 1), (0, 0), (0, 0))) for e in parts])
+        rows, places = np.nonzero((block >= 0) & (block % PARTS == part))
+        steps = np.array(HORIZONS)[places]
+        e, seen = errors[rows, steps - 1], np.isfinite(y[rows + steps])
+        off = np.where(np.abs(e) < WORST, e, WORST) ** 2 * seen  # NaN is WORST
+        for total, weights in zip(sums, (off, seen), strict=True):
+            np.add.at(total, (block[rows, places], places), weights)
     return sums
-
-
-def _filtered(model: Innovations, data: Sequence[Signals]) -> list[tuple[Array, Array]]:
-    """Return the estimates and the effects of the inputs ``(T + 1, n)`` of each trajectory."""
-    pad = (0, 0), (0, 1), (0, 0)
-
-    def both(y: Array, *v: Array) -> Iterator[tuple[Array, Array]]:
-        return zip(model.estimates(y, *v), np.pad(model.inputs(*v), pad), strict=True)
-
-    return each(model, data, both)
 
 
 def _score(total: Array, count: Array) -> float:
