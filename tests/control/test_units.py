@@ -82,7 +82,7 @@ def test_a_remedy_names_a_weight_in_each_input_s_own_unit():
         ([[0.9]], [[0.5, 4e-4]]), 10, Q=1.0, u_bounds=([-1.0, -1e3], [1.0, 1e3])
     )
     (fault,) = (x for x in qm.Controller(singular).review().faults if x.name == "cost")
-    assert "R={'u1': 0.01, 'u2': 1e-08}" in fault.remedy
+    assert "R={'u1': 0.001, 'u2': 1e-09}" in fault.remedy
     assert controller.review()["cost"].ok
 
 

@@ -10,16 +10,14 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
 from torch_qpmpc.control.design import DECIDES, Design, Target
-from torch_qpmpc.control.disturbance import TINY, choose, unseen_modes
+from torch_qpmpc.control.disturbance import choose, unseen_modes
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.control.simulation import centre, last_known, simulate
 from torch_qpmpc.control.state_space import Array
-from torch_qpmpc.errors import SolverError
-from torch_qpmpc.export.tables import SINGULAR
-from torch_qpmpc.qp.pipeline.condensing import null_space
+from torch_qpmpc.errors import QPError, SolverError
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
 MARGIN, HIDDEN = 0.3, 1e-3
@@ -84,9 +82,13 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         held = np.tile(r_last[-1], rows), np.tile(known, rows), law.estimates(memory)[1]
         law, _ = law.aimed(*held)
         mpc, design = law.mpc, law.design
-    cost, terminal = _cost(mpc), _terminal(design)
+    loop, wrong, terminal = None, "", _terminal(design)
+    try:
+        loop = LinearLoop.of(mpc, law.observer)
+    except QPError as error:
+        wrong = str(error)
     findings = [
-        cost,
+        _cost(mpc, wrong),
         terminal,
         *([_model(design, errors)] if errors is not None and np.isfinite(errors).any() else []),
         *([_free_inputs(design)] if design.free.any() else []),
@@ -98,9 +100,8 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         set_points(mpc, law.estimates(memory)[1], known, r_last, assumed),
     ]
     findings += [_levels(law, r_last, known)] if design.levels else []
-    if not cost.ok:
+    if loop is None:
         return Review(findings)
-    loop = LinearLoop.of(mpc, law.observer)
     findings.append(_stability(loop, design.gamma, terminal.remedy))
     if findings[-1].ok:
         findings += [_margin(loop, law), _offset(loop, design)]
@@ -109,28 +110,16 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     return Review(findings)
 
 
-def _cost(mpc: LinearMPC) -> Finding:
-    """H is positive definite on the plans that satisfy C z = b, in signals divided by sizes."""
-    qp, design = mpc.plan.quadratic_program(), mpc.design
-    y, u, x, _ = design.scaling
-    off = y[design.weighted[: 0 if design.references == "preview" else None]]
-    of_y, of_u = design.bounded
-    state = (x, u[: len(u) * design.moves], off, y[of_y], u[of_u], [1.0])
-    later = np.tile(np.concatenate((u, *state)), mpc.horizon)
-    units = np.concatenate((np.ones(mpc.plan.n_p), later))
-    H, C = (x.detach().double().numpy() * units for x in (qp.H, qp.C))
-    C = C / np.maximum(np.abs(C).max(1, keepdims=True, initial=0.0), TINY)
-    T_v = null_space(C[None], mpc.plan.n_p).T[0][:, mpc.plan.n_p :]
-    H = units[:, None] * H
-    sizes = np.linalg.eigvalsh(T_v.T @ (H + H.T) @ T_v / 2)
-    ok = bool(sizes[0] > SINGULAR * sizes[-1])
-    text = f"The eigenvalues of the plan's cost are {sizes[0]:.3g} to {sizes[-1]:.3g}."
-    most = sizes[-1] if sizes[-1] > SINGULAR * design.typical else design.typical  # of prices
-    least = {x: float(f"{1e-3 * most / u[i] ** 2:.1g}") for i, x in enumerate(design.plant.inputs)}
+def _cost(mpc: LinearMPC, wrong: str) -> Finding:
+    """H is positive definite on the plans that satisfy C z = b: nothing is ``wrong`` with it."""
+    design = mpc.design
+    sizes = zip(design.plant.inputs, design.scaling.u, strict=True)
+    least = {x: float(f"{1e-3 * (design.typical or 1.0) / size**2:.1g}") for x, size in sizes}
     remedy = f"Raise the weights of the inputs to R={least}."
-    if sizes[0] < -SINGULAR * abs(sizes[-1]):
-        remedy = "Learning has made it indefinite: mpc.plan.reset_parameters(), or learn others."
-    return Finding("cost", ok, text, remedy * (not ok))
+    if mpc.plan.learned:
+        remedy += " If learning has made it indefinite, mpc.plan.reset_parameters()."
+    text = f"{wrong.partition('. ')[0]}." if wrong else "Each plan has a cost with one minimum."
+    return Finding("cost", not wrong, text, remedy * bool(wrong))
 
 
 def _terminal(design: Design) -> Finding:
