@@ -64,9 +64,9 @@ def test_bad_arguments_are_named(arguments):
 
 
 @refused(
-    ({"state_bounds": ([-1.0], [1.0])}, r"state_bounds: got shape \(1,\), expected shape \(2,\) o"),
+    ({"state_bounds": ([-1.0], [1.0])}, r"state_bounds: got shape \(1,\), expected shape \(2,\)"),
     ({"constraints": (torch.ones(2, 2), [0.0] * 2, [1.0] * 2)}, r"constraints: got D of shape \(2"),
-    ({"constraint_slack": [1.0]}, r"constraint_slack: got \[1.0\], expected a non-negative .* one"),
+    ({"constraint_slack": [1.0]}, r"constraint_slack: got shape \(1,\), expected shape"),
 )
 def test_a_scheme_refuses_bounds_of_other_sizes(arguments):
     Scheme(Layout(2, 1, 3), bounds=Bounds(**arguments))

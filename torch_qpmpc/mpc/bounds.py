@@ -115,8 +115,8 @@ class Bounds:
         n_x, n_u, n_d = layout.n_x, layout.n_u, layout.n_d
         D = _matching_rows("constraints", self.constraints, n_d + layout.n)
         D_f = _matching_rows("terminal_constraints", self.terminal_constraints, n_d + n_x)
-        x = _matching_pair("state_bounds", self.state_bounds, n_x)
-        u = _matching_pair("action_bounds", self.action_bounds, n_u)
+        pairs, none = zip(PAIRS, (n_x, n_u), strict=True), (-torch.inf, torch.inf)
+        x, u = ([_sized(k, side, n) for side in getattr(self, k) or none] for k, n in pairs)
         if (levels := self.action_levels) is not None and self.level_rows is None:
             if len(levels) != n_u:
                 want = f"{n_u}, one for each action, or None"
@@ -124,7 +124,7 @@ class Bounds:
             u = hull("action_bounds", u, levels, [f"action {i}" for i in range(n_u)])
         lower, upper = (layout.rows(*side) for side in zip(x, u, D[1:], D_f[1:], strict=True))
         sizes = zip(SLACKS, (n_x, n_u, layout.n_mixed + layout.n_terminal), strict=True)
-        x, u, linear = (_matching_slack(name, getattr(self, name), n) for name, n in sizes)
+        x, u, linear = (_sized(name, getattr(self, name), n) for name, n in sizes)
         w = layout.rows(x, u, *linear.split((layout.n_mixed, layout.n_terminal)))
         G = LinearRows(layout)(D[0], D_f[0])
         return {"G": G, "lb": lower, "ub": upper, "w": w}
@@ -170,7 +170,7 @@ def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
     if matrix.ndim != 2:
         raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", "a matrix")
     pair = _pair(f"{name}, bounds", (lower, upper))
-    return matrix, *_matching_pair(f"{name}, bounds", pair, len(matrix))
+    return matrix, *(_sized(f"{name}, bounds", side, len(matrix)) for side in pair)
 
 
 def _slack(name: str, weight: Any) -> float | Tensor:
@@ -185,16 +185,13 @@ def _slack(name: str, weight: Any) -> float | Tensor:
     raise QPError.expected(name, repr(weight), want)
 
 
-def _matching_pair(
-    name: str, bounds: tuple[Tensor, Tensor] | None, size: int
-) -> tuple[Tensor, Tensor]:
-    if bounds is None:
-        unbounded = torch.full((size,), torch.inf, dtype=torch.float64)
-        return -unbounded, unbounded
-    if len(bounds[0]) != size:
-        got = f"shape {tuple(bounds[0].shape)}"
-        raise QPError.expected(name, got, f"shape ({size},) on each side")
-    return bounds
+def _sized(name: str, value: float | Tensor, size: int) -> Tensor:
+    """Return one number for each of ``size`` entries."""
+    if not isinstance(value, Tensor):
+        return torch.full((size,), value, dtype=torch.float64)
+    if len(value) != size:
+        raise QPError.expected(name, f"shape {tuple(value.shape)}", f"shape ({size},)")
+    return value
 
 
 def _matching_rows(
@@ -206,12 +203,3 @@ def _matching_rows(
     if rows[0].shape[1] != width:
         raise QPError.expected(name, f"D of shape {tuple(rows[0].shape)}", f"shape (m, {width})")
     return rows
-
-
-def _matching_slack(name: str, weight: float | Tensor, size: int) -> Tensor:
-    if not isinstance(weight, Tensor):
-        return torch.full((size,), weight, dtype=torch.float64)
-    if len(weight) != size:
-        want = f"a non-negative weight, or inf for hard rows; or one for each of the {size}"
-        raise QPError.expected(name, f"{weight.tolist()}", want)
-    return weight
