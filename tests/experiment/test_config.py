@@ -149,7 +149,6 @@ def test_missing_keys(key):
     ("constraint=si replay=false", "replay: got False, expected true. constraint.si"),
     ("constraint.structure=tied", "constraint.structure: got 'tied', expected free. A tied C"),
     ("constraint=si constraint.structure=tied", ".*got 'tied', expected free. gauss_new"),
-    ("constraint=mpc constraint.learn=[C,G]", r".*got \['C', 'G'\], expected no G. No task has"),
     ("task.terminal_weight=riccati", ".*got 'riccati', expected default or identity. The Ricc"),
     ("noise=uniform", "noise.name: got 'uniform', expected a noise of task point_mass: gauss"),
     ("task=gros_zanon noise.std=0.1", "noise.std: got 0.1, expected null. The noise of gros"),

@@ -144,8 +144,6 @@ class Design:
         """
         if isinstance(old := getattr(self, name), dict):
             return {**old, **changes}
-        if unknown := sorted({*changes} - {*names}):
-            raise QPError.expected(name, repr(unknown[0]), f"names among {', '.join(names)}")
         if name.endswith("_bounds"):
             sides = [*zip(*(side.tolist() for side in old), strict=True)]
             limited = {} if name == "du_bounds" else self.limits

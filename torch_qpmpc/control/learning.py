@@ -1,11 +1,7 @@
-"""`Controller.learn`: a model from a closed loop or a log, kept if closed loops cost less with it.
+"""`Controller.learn`: a model from closed loops or a log; and `improve`: theta by gradients.
 
-The candidate is the controller with a state-space model that is identified from the transitions,
-in its observer, its target and its plan. Its weights, bounds and names are the same. Paired loops,
+The candidate of `learn` has the new model in its observer, its target and its plan. Paired loops,
 with the same set-points and noise for both, decide (`torch_qpmpc.learning.gate.PairedTest`).
-
-`Controller.improve`: theta by gradients through closed loops of a log's model, as
-`torch_qpmpc.learning.closed_loop` has them for a `QPMPC`.
 """
 
 from __future__ import annotations

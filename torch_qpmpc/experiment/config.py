@@ -252,8 +252,6 @@ class Config(Group):
         if tied and part.si and self.optimizer.name == "gauss_newton":
             remedy = "gauss_newton needs a free C for constraint.si."
             self.conflict("constraint.structure", "free", remedy)
-        if tied and "G" in part.learn:
-            self.conflict("constraint.learn", "no G", "No task has mixed constraints to learn.")
         if self.task.terminal_weight == "riccati" and self.task.hessian == "diagonal":
             remedy = "The Riccati weight needs task.hessian=block."
             self.conflict("task.terminal_weight", "default or identity", remedy)

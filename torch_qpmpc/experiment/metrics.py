@@ -57,15 +57,11 @@ class Tally:
     @contextmanager
     def timed(self) -> Iterator[list[float]]:
         """Count an update's QPs, and list its times: the begin, those that are added, the end."""
-
-        def leave_out(compilation: float) -> None:
-            self.seconds -= compilation
-
-        times = [time.perf_counter()]
-        with self.qps, install_timer("numba:compile", leave_out):
+        times, compiled = [time.perf_counter()], list[float]()
+        with self.qps, install_timer("numba:compile", compiled.append):
             yield times
         times.append(time.perf_counter())
-        self.seconds += times[-1] - times[0]
+        self.seconds += times[-1] - times[0] - sum(compiled)
 
     def add(self, batch: TensorDictBase, terms: Mapping[str, Tensor]) -> None:
         """Add an update with its collected batch and the terms of its loss."""

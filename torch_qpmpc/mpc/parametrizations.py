@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout, banded_matrix
 from torch_qpmpc.mpc.projections import CHOLESKY
+from torch_qpmpc.mpc.validation import check_weight
 
 #: The parts of theta whose sign a convex QP constrains.
 SIGNED = ("H", "H_f", "w")
@@ -82,7 +83,7 @@ class SquareRoot(nn.Module):
 
     def right_inverse(self, value: Tensor) -> Tensor:
         """Return a factor of ``value``; raise `QPError` if an entry is negative."""
-        _check_diagonal(value)
+        check_weight("diagonal", value, diagonal=True, n_d=0)
         return value.sqrt()
 
 
@@ -103,7 +104,7 @@ class Support(nn.Module):
 
     def right_inverse(self, value: Tensor) -> Tensor:
         """Return ``value``; raise `QPError` if an entry is negative."""
-        _check_diagonal(value)
+        check_weight("diagonal", value, diagonal=True, n_d=0)
         return value
 
 
@@ -280,11 +281,6 @@ def _linear_rows(G: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
     mixed = layout.horizon * layout.n_mixed
     _, D, D_f = G.split((layout.n_z - layout.n_preview, mixed, layout.n_terminal))
     return D, D_f
-
-
-def _check_diagonal(value: Tensor) -> None:
-    if (value < 0).any():
-        raise QPError.expected("diagonal", f"{value.min():.3g}", "non-negative entries")
 
 
 def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
