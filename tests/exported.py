@@ -133,8 +133,9 @@ def random_qp(seed: int) -> Any:
     theta = (H, rng.standard_normal(n_z), rng.standard_normal(), C, b, G, lb, ub, w)
     tensors = (torch.as_tensor(x, dtype=torch.float64) for x in theta)
     qp = QuadraticProgram(*tensors, check_values=False)
-    parts = {"n_p": n_p, "n_u": n_u, "constants": {}, "sequential": None, "levels": None}
-    return SimpleNamespace(quadratic_program=lambda: qp, **parts)
+    parts = {"n_p": n_p, "n_u": n_u, "sequential": None, "levels": None}
+    scheme = SimpleNamespace(constants={})
+    return SimpleNamespace(quadratic_program=lambda: qp, scheme=scheme, **parts)
 
 
 def draw_known(mpc: Any, count: int, seed: int = 0) -> np.ndarray:

@@ -126,7 +126,7 @@ def test_an_mpc_has_a_plan_and_is_none():
     """`QPMPC.of` and others were inherited, and failed."""
     mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1, learn=("H",))
     assert not {"of", "from_model", "from_data", "policy"} & {*dir(mpc)}
-    assert mpc.plan.constants == {mpc.plan.n_p - 1: 1.0}
+    assert mpc.plan.scheme.constants == {mpc.plan.n_p - 1: 1.0}
     assert mpc.options["learn"] == {"H": True}
     assert repr(mpc) == "LinearMPC(y1 by u1; horizon 3; Q [1.0]; dR [0.1]; learned H)"
 

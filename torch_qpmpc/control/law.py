@@ -340,15 +340,15 @@ class Law:
         s[:, n_y : n_y + len(w)] = w
         s[:, n_y + len(w) : -1] = known - design.nominal
         s[:, -1] = 1.0
-        target = aimed(design, np, self._aim, s)
-        return target if design.staged else Target(*(part[0] for part in target))
 
-    def _aim(self, state: Array) -> tuple[Array, Array]:
-        """Solve the target's QP, for one state or one for each stage."""
-        solution = self.aims.solve(state)
-        if solution.status.any():
-            raise SolverError("No input holds the plant within the hard bounds.")
-        return solution.z, solution.lam
+        def solve(state: Array) -> tuple[Array, Array]:
+            solution = self.aims.solve(state)
+            if solution.status.any():
+                raise SolverError("No input holds the plant within the hard bounds.")
+            return solution.z, solution.lam
+
+        target = aimed(design, np, solve, s)
+        return target if design.staged else Target(*(part[0] for part in target))
 
     def observed(self, memory: Memory, y: Array, u: Array, known: Array) -> tuple[Memory, Outcome]:
         """Return the memory after a step in which the input u was applied, and its status.

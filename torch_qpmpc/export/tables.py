@@ -11,6 +11,7 @@ and the dual problem is a QP in lam alone, with -w <= lam <= w. The rows are sca
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -97,7 +98,7 @@ class Tables:
     condition: float
     centre: Array
     usual: Array
-    constants: dict[int, float]
+    constants: Mapping[int, float]
     levels: Levels | None
     decisions: dict[str, Array]
     digest: str
@@ -182,9 +183,9 @@ def make_tables(mpc: QPMPC) -> Tables:
         u_lower=u_lower,
         u_upper=u_upper,
         condition=condition,
-        centre=_centre(qp, n_p, mpc.constants),
+        centre=_centre(qp, n_p, mpc.scheme.constants),
         usual=np.where(own > 0, own, 1.0) ** -0.5,
-        constants=mpc.constants,
+        constants=mpc.scheme.constants,
         levels=levels,
         decisions=decisions,
         digest=digest(qp),
@@ -246,7 +247,7 @@ def _action_bounds(G: Array, lb: Array, ub: Array, w: Array, u: slice) -> tuple[
 
 
 @torch.no_grad()
-def _centre(qp: QuadraticProgram, n_p: int, constants: dict[int, float]) -> Array:
+def _centre(qp: QuadraticProgram, n_p: int, constants: Mapping[int, float]) -> Array:
     """Return the p of the plan whose bounded rows are nearest to the middle of their bounds."""
     names = ("C", "b", "G", "lb", "ub", "w")
     C, b, G, lb, ub, w = (getattr(qp, name).detach().double().cpu() for name in names)

@@ -566,11 +566,6 @@ class QPMPC(nn.Module):
         return ", ".join(f"{x}={getattr(self, x)!r}" for x in (*names, "learned", "solver"))
 
     @property
-    def constants(self) -> dict[int, float]:
-        """The entries of p that have one value only, such as a 1 in the state."""
-        return {**self.scheme.constants}
-
-    @property
     def arguments(self) -> dict[str, Any]:
         """The arguments of `QPMPC.of`, as tensors and plain values."""
         return self.scheme.arguments | self._options()
