@@ -28,13 +28,13 @@ LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 BUDGET = {
     ".": 297,
     "analysis": 846,
-    "control": 4819,  # nonlinear plants
+    "control": 4799,  # nonlinear plants
     "envs": 1346,
-    "experiment": 2740,
-    "export": 1446,
-    "learning": 2796,  # models that did not train theta decide in improve
-    "identification": 2656,  # dead times beyond the orders are told
-    "mpc": 3839,
+    "experiment": 2724,
+    "export": 1431,
+    "learning": 2791,  # models that did not train theta decide in improve
+    "identification": 2642,  # dead times beyond the orders are told
+    "mpc": 3818,
     "proofs": 1001,
     "qp": 5295,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for

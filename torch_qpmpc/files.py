@@ -67,8 +67,7 @@ def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
         got = f"{path}, {'which another program wrote' if of is None else f'a saved {of}'}"
         remedy = f"{of}.load reads it." if of in ("Controller", "QPMPC") else ""
         raise QPError.expected("path", got, expected, remedy)
-    version = content.get("version")
-    if version != VERSION:
+    if (version := content.get("version")) != VERSION:
         got, remedy = f"{path}, whose format has version {version!r}", "Make the file again."
         if version != 1:  # which no release wrote
             remedy = "A newer release wrote it: pip install --upgrade torch-qpmpc."
