@@ -170,7 +170,8 @@ def _linear_rows(name: str, rows: Any) -> tuple[Tensor, Tensor, Tensor]:
     if matrix.ndim != 2:
         raise QPError.expected(name, f"D of shape {tuple(matrix.shape)}", "a matrix")
     pair = _pair(f"{name}, bounds", (lower, upper))
-    return matrix, *(_sized(f"{name}, bounds", side, len(matrix)) for side in pair)
+    lower, upper = (_sized(f"{name}, bounds", side, len(matrix)) for side in pair)
+    return matrix, lower, upper
 
 
 def _slack(name: str, weight: Any) -> float | Tensor:
