@@ -403,8 +403,8 @@ class Controller:
         are ``u.q`` and ``status``. While ``manual`` is true, it records ``applied.q`` as `observe`
         does. ``last.q`` is the input before the start, and with ``rests`` it starts as by
         ``reset(y, u, known)``. ``lower.q`` and ``upper.q`` are bounds. A step takes the model's dt,
-        or a second. ``name`` is the model's identifier; the options are ``max_iterations`` alone, as
-        in `export_c`, whose report it returns for ``path``.
+        or a second. ``name`` is the model's identifier; the options are ``max_iterations`` as in
+        `export_c`, whose report it returns for ``path``.
 
         Raises:
             QPError: no C compiler is installed, or as in `export_c`.
