@@ -346,6 +346,15 @@ def test_a_learned_cost_that_is_indefinite_is_named():
         found["stability"]
 
 
+def test_learned_bounds_that_cross_are_no_fault_of_the_cost():
+    mpc = qm.LinearMPC(LAG, 5, Q=1.0, R=0.1, y_bounds=(-1.0, 1.0), learn=("lb",))
+    with torch.no_grad():
+        for leaf in mpc.plan.leaves("lb"):
+            leaf += 3.0
+    with pytest.raises(qm.QPError, match=r"^lb: got entries above ub, expected lb <= ub in every"):
+        qm.Controller(mpc).review()
+
+
 # The linear loop
 
 

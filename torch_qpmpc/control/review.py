@@ -87,6 +87,8 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
         loop = LinearLoop.of(mpc, law.observer)
     except QPError as error:
         wrong = str(error)
+        if not wrong.startswith("H: "):
+            raise
     findings = [
         _cost(mpc, wrong),
         terminal,
