@@ -15,18 +15,20 @@ def up_to_date() -> bool:
 
 
 def compile_kernels() -> None:
-    """Train briefly, solve a QP of large numbers, and identify a model."""
+    """Train briefly, solve a QP of large numbers, plan on levels, and identify models."""
     import numpy as np
 
     import train
     from tests.campaign.families import FAMILIES, Draw
     from tests.runs import SMALL, make_config
-    from torch_qpmpc import identify, solve_qp
+    from torch_qpmpc import QPMPC, identify, solve_qp
 
     with tempfile.TemporaryDirectory() as folder:
         train.train(make_config(*SMALL, "optimizer=gauss_newton"), folder, quiet=True)
     case = FAMILIES["scaled cost"](Draw(7), 3)
     solve_qp(case.known.qp, case.known.fixed, solver="daqp")
+    weights = {"stage_weight": [1.0, 1.0], "action_levels": [(0.0, 1.0)]}
+    QPMPC.from_model([[0.9]], [[0.5]], 3, **weights).predict([1.0])
     y, u = np.random.default_rng(0).normal(size=(2, 40))
     identify({"y": y, "u": u}, 1, order=1)
     DONE.parent.mkdir(exist_ok=True)

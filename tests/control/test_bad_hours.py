@@ -275,7 +275,7 @@ def test_c_and_python_do_the_same_in_all_bad_hours():
         exported(two_signals, missing=True),
     )
     for i, pair in enumerate(pairs):
-        difference, counts = soak(*pair, 600, 3, i)
+        difference, counts = soak(*pair, 400, 3, i)
         assert difference < 1e-9
         assert min(counts[x] for x in ("dropouts", "absurd values", "MISSING", "INVALID")) > 0
         assert counts["manual steps"] == 150

@@ -205,7 +205,7 @@ def test_c_equals_python_with_minimum_times_manual_mode_and_missing_outputs(name
     twin, rng = load(report.files, controller), np.random.default_rng(0)
     A, B, C = (np.array(getattr(controller.mpc.design.plant, x)) for x in "ABC")
     x, codes, applied = np.zeros(len(A)), set(), []
-    for k in range(200):
+    for k in range(130):
         y = C @ x + 0.02 * rng.normal(size=len(C))
         y[rng.random(len(C)) < 0.1 * (k > 0)] = np.nan
         r = np.append([2.0 + 2.0 * (k // 20 % 2)], np.zeros(len(C) - 1))

@@ -182,6 +182,6 @@ def test_zones_alone_rest_where_the_inputs_cost_least():
     ],
 )
 def test_c_plans_for_the_same_set_points(make, options):
-    difference, counts = soak(*exported(make, **options), 300, 0, 1, size=8.0, faults=0.0)
+    difference, counts = soak(*exported(make, **options), 150, 0, 1, size=8.0, faults=0.0)
     assert difference < 1e-8
-    assert counts["SOLVED"] == 300
+    assert counts["SOLVED"] == 150

@@ -18,12 +18,13 @@ UNWEIGHTED = np.diag([1.0, 0.8]), TWO, TWO, 0 * TWO[:, :1]
 SLOW = np.diag([1.0, 1 - 1e-10]), TWO, TWO, 0 * TWO[:, :1]
 
 
-def rounded(plant, seed):
-    """Return a plant in a random basis of its state, and with rounding of entries."""
-    rng, (A, B, C, E) = np.random.default_rng(seed), plant
-    T = np.linalg.qr(rng.normal(size=A.shape))[0]
-    yield T @ A @ T.T, T @ B, C @ T.T, T @ E
-    yield *(part + 1e-16 * rng.normal(size=part.shape) for part in (A, B, C)), E
+def rounded(plant):
+    """Return a plant in random bases of its state, and with rounding of entries."""
+    A, B, C, E = plant
+    for rng in map(np.random.default_rng, (0, 1)):
+        T = np.linalg.qr(rng.normal(size=A.shape))[0]
+        yield T @ A @ T.T, T @ B, C @ T.T, T @ E
+        yield *(part + 1e-16 * rng.normal(size=part.shape) for part in (A, B, C)), E
 
 
 def moves(plant, **options):
@@ -41,7 +42,6 @@ def moves(plant, **options):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize(
     ("plant", "options"),
     [
@@ -57,9 +57,9 @@ def moves(plant, **options):
         (SLOW, {"Q": 1.0, "dR": 0.1, "disturbances": None, **BOUNDS}),
     ],
 )
-def test_rounding_changes_no_move_and_no_finding(plant, options: dict[str, Any], seed):
+def test_rounding_changes_no_move_and_no_finding(plant, options: dict[str, Any]):
     u, *found = moves(plant, **options)
-    for other in rounded(plant, seed):
+    for other in rounded(plant):
         v, *others = moves(other, **options)
         assert np.allclose(u, v, atol=1e-7)
         assert found == others

@@ -106,7 +106,7 @@ PENDULUM = ("task=gymnasium", "task.id=Pendulum-v1", *DATA, "constraint=free", "
 @pytest.mark.filterwarnings("ignore:The fitted stage cost")
 def test_logs_of_any_kind_have_a_rival_or_a_reason(order):
     """Of estimates and of outputs, of few rows, and without an episode's end."""
-    cfg = make_config(*PENDULUM, "rivals=[identification]", "task.eval_steps=5")
+    cfg = make_config(*PENDULUM, "rivals=[identification]", "task.eval_steps=2")
     physics = make_physics(cfg)
     log = collect_log(cfg, physics)
     start = identified_start(cfg, physics, log, order)

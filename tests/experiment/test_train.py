@@ -213,7 +213,9 @@ def test_uneven_intervals_and_steps(tmp_path):
 def test_training_continues_past_unsolved_qps(tmp_path):
     """Hard state bounds are infeasible at high velocities."""
     more = ("task.state_slack=inf", "noise.std=0.5", "constraint=free")
-    summary = run_small(tmp_path, *more, "task.episode_steps=5", "eval_interval=9")
+    summary = run_small(
+        tmp_path, *more, "task.episode_steps=5", "eval_interval=9", "task.eval_steps=2"
+    )
     table = metrics(tmp_path).drop(index=0)
     assert summary["unsolved"] == table["qp/unsolved"].sum() > 0
     assert table["train/unsolved"].sum() > 0

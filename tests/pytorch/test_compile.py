@@ -41,7 +41,7 @@ def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tenso
     [
         ("value", "state"),
         ("action value", "preview"),
-        ("policy", "state"),
+        pytest.param("policy", "state", marks=pytest.mark.slow),
         ("vmap of action value", "state"),
     ],
 )

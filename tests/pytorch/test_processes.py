@@ -1,12 +1,8 @@
 """Solving in threads and processes with every solver, after and during other solves."""
 
-import os
-import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,10 +12,11 @@ from torch.func import grad, jacrev, vmap
 from torch.testing import assert_close
 
 from tests.problems import drawn_mpc, random_mpc, random_states
+from tests.runs import ended
 from torch_qpmpc import QPMPC
 from torch_qpmpc.qp.solvers import BACKENDS
 
-ROOT = Path(__file__).parents[2]
+METHODS = [x for x in ("fork", "spawn") if x in torch.multiprocessing.get_all_start_methods()]
 #: Seconds after which a hanging child is killed.
 WATCHDOG = 120
 
@@ -72,31 +69,24 @@ def scenario(method: str, *solvers: str) -> None:
     child = context.Process(target=check, args=(mpcs, expected, threads), daemon=True)
     child.start()
     child.join(WATCHDOG)
-    assert child.exitcode == 0, "it hung" if child.exitcode is None else "it failed"
+    code = child.exitcode
+    child.kill()
+    assert code == 0, "it hung" if code is None else "it failed"
     check(mpcs, expected)
     assert torch.get_num_threads() == 2
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("fork", "daqp"),
-        pytest.param(("fork",), marks=pytest.mark.slow),
-        pytest.param(("spawn",), marks=pytest.mark.slow),
-    ],
-    ids=" ".join,
-)
-def test_a_child_has_the_answers_of_its_parent(arguments):
-    if arguments[0] not in torch.multiprocessing.get_all_start_methods():
-        pytest.skip("not on this platform")
-    code = f"from tests.pytorch.test_processes import scenario; scenario(*{arguments!r})"
-    # In a separate session, so that hanging grandchildren can be killed, too.
-    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True)
-    try:
-        assert process.wait(4 * WATCHDOG) == 0
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+@pytest.mark.skipif("fork" not in METHODS, reason="not on this platform")
+def test_a_fork_has_the_answers_of_its_parent():
+    scenario("fork", "daqp")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_a_child_has_the_answers_of_its_parent(method):
+    """With each solver."""
+    code = f"from tests.pytorch.test_processes import scenario; scenario({method!r})"
+    ended(sys.executable, "-c", code)
 
 
 def test_threads_that_solve_at_once_get_the_same_answers(solver):
