@@ -7,7 +7,7 @@ noise and its filter are identified from the log; gradients through closed loops
 theta, without a transition of the plant. J is that of the plant: on Gros and Zanon's system the
 cost of a step, after 100 steps, in 32 loops that chose nothing; on he2 that of an episode; on the
 tank that of a step, in 32 loops of 96. Finished rows are kept in docs/results/closed_loops.csv; the
-table goes into docs/results/improvement.md. ``--time`` measures a hundred gradients instead.
+table goes into docs/results/improvement.md.
 """
 
 import argparse
@@ -176,43 +176,11 @@ def run(name: str, seed: int) -> dict[str, Any]:
     return {"case": name, "seed": seed} | J | of_model | ends
 
 
-def timed() -> float:
-    """Return the CPU seconds of a hundred gradients of 32 loops of 100 steps; N = 10, 8 states."""
-    rng = np.random.default_rng(0)
-    A, B = rng.normal(size=(8, 8)), rng.normal(size=(8, 2))
-    A *= 0.95 / abs(np.linalg.eigvals(A)).max()
-    logs = []
-    for _ in range(20):
-        x, u = [rng.normal(size=8)], rng.uniform(-1, 1, (50, 2))
-        for k in range(50):
-            x.append(A @ x[-1] + B @ u[k] + 0.1 * rng.normal(size=8))
-        logs.append({"y": np.array(x), "u": u})
-    found = qm.identify(logs, 10, order=0)
-    mpc = qm.QPMPC.of(
-        **found.arguments,
-        hessian="block",
-        stage_weight=torch.eye(10).double(),
-        action_bounds=([-1.0] * 2, [1.0] * 2),
-        state_bounds=([-3.0] * 8, [3.0] * 8),
-        structure="tied",
-        learn=("H", "H_f", "q", "b", "lb", "ub"),
-        solver="daqp",
-    )
-    qm.improve(mpc, found, updates=1, held_out=16)  # which compiles
-    began = time.process_time()
-    qm.improve(mpc, found, updates=100, held_out=16)
-    return time.process_time() - began
-
-
 def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.closed_loops")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=[*CASES])
-    parser.add_argument("--time", action="store_true", help="measure a hundred gradients")
     options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
-    if options.time:
-        print(f"{timed():.0f} s")
-        return
     rows = keep(options.results, itertools.product(options.cases, options.seeds), run)
     write_section(options.page, shown(rows), "closed-loops")
 

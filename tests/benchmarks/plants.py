@@ -1,4 +1,4 @@
-"""Plants that no package has: a swing-up, two stocks in a row, and three of known optimum."""
+"""Plants that no package has: a swing-up, two stocks in a row, and two of known optimum."""
 
 from __future__ import annotations
 
@@ -205,8 +205,7 @@ def _inputs(dt: float, n: int, m: int) -> np.ndarray:
 
 
 #: Of Ibrahim et al., 2026, "Benchmarking Reinforcement Learning via Stochastic Converse Optimality"
-#: (arXiv 2603.17631): the first two without disturbances that V does not know, and the arm with two
-#: links, of which an action loses its effect as the cosine of the link's angle.
+#: (arXiv 2603.17631), without disturbances that V does not know.
 CONVERSE = {
     "Unicycle": Known(
         P=np.diag([1 / 9, 1 / 9, 1, 1, 1]),
@@ -240,24 +239,6 @@ CONVERSE = {
         starts=np.array([2.0, 2.0, 1.0, 1.0]),
         limit=25.0,
         steps=20,
-    ),
-    "Arm": Known(
-        P=np.array(
-            [[1.4, 0.2, 0.1, 0], [0.2, 1.5, 0.2, 0.1], [0.1, 0.2, 1.6, 0.2], [0, 0.1, 0.2, 1.5]]
-        ),
-        share=0.05,
-        R=2.0,
-        gamma=0.99,
-        noise=np.array([0.0, 1e-3, 0.0, 1e-3]),
-        G=lambda x: 0.8 * np.cos(x[::2]) * np.eye(4)[:, 1::2],
-        turns=lambda x: (
-            (0, 1, 0.1 * np.tanh(x[0] * x[1]) + 0.64 * np.sin(x[0])),
-            (2, 3, 0.1 * np.tanh(x[2] * x[3]) + 0.64 * np.sin(x[2])),
-            (1, 3, 0.08 * np.tanh(x[2] - x[0])),
-        ),
-        starts=np.array([2.8, 1.2, 2.8, 1.2]),
-        limit=2.0,
-        steps=100,
     ),
 }
 

@@ -1,4 +1,4 @@
-"""`improve` and Q-learning beside classical designs: ``python -m tests.benchmarks.rivals``.
+"""`improve` beside classical designs: ``python -m tests.benchmarks.rivals``.
 
 Seven plants with a bounded input, hidden states and an asymmetric cost. On Dosing and Balance the
 noise grows with state and action in a way that no design knows; the noise of the others is
@@ -15,7 +15,6 @@ Each design knows the log, the cost and the input's bounds, and nothing else of 
 - ``expanded``: ``mean`` with the regulator's cost, that of the output in noise to second order.
 - ``improve``: q and the soft bound by gradients through the same loops, from ``mean``.
 - ``improve, H``: the weights, too.
-- ``Q-learning``: half of the transitions are its log, and it collects the others.
 
 J is the mean cost of a step in 1,000 loops of the plant, drawn for each seed, four times as long as
 those that train. Finished rows are kept in docs/results/rivals.csv; the table goes into
@@ -24,12 +23,10 @@ docs/results/improvement.md.
 
 import argparse
 import math
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,14 +37,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 import torch_qpmpc as qm
-import train
 from tests.benchmarks.table import DOCS, options_of, table, write_section
-from tests.runs import make_config
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.envs.linear_system import float64, normal, uniform
 from torch_qpmpc.envs.plant import Plant
-from torch_qpmpc.experiment.start import LOG, Exploration, stored_log
-from torch_qpmpc.experiment.tasks import Task, plant_layout, register
+from torch_qpmpc.experiment.start import Exploration
+from torch_qpmpc.experiment.tasks import plant_layout
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.learning.closed_loop import filtered, growth, simulated_plant
 from torch_qpmpc.mpc.riccati import affine_cost_to_go, riccati_weight
@@ -228,30 +223,6 @@ def collect(plant: Priced, transitions: int, seed: int) -> Any:
     return log.contiguous()
 
 
-def scheme(plant: Any, model: qm.Model, gamma: float, moved: float, effort: float) -> qm.Scheme:
-    """Return MPC with the set-point moved by so much, and the input's weight times a factor."""
-    layout, p = plant_layout(plant, HORIZON), plant.price
-    r, weight = p.r + moved, torch.zeros(layout.n).double()
-    weight[0], weight[-1] = 2 * p.weight + p.above, 2 * effort * p.effort
-    q, lower = torch.zeros_like(weight), torch.full((layout.n_x,), -math.inf).double()
-    q[0] = p.slope - weight[0] * r
-    soft: dict[str, Any] = {}
-    if p.price:
-        lower[0] = r
-        soft = {"state_bounds": (lower, torch.full_like(lower, math.inf)), "state_slack": p.price}
-    bounds = qm.Bounds(action_bounds=(plant.lb_a, plant.ub_a), discount_slack=True, **soft)
-    q = q.repeat(HORIZON + 1)[: layout.n_z]
-    W, last = torch.diag(weight), torch.diag(weight[:-1])
-    if model.A is not None:  # the cost to go of the regulator about r
-        A, B, offset, aim = model.A, model.B, model.offset, torch.zeros_like(weight)
-        aim[0] = -weight[0] * r
-        last = riccati_weight(A, B, W, gamma)
-        end, _ = affine_cost_to_go(A, B, offset, W, aim, last, gamma)
-        q[-layout.n_x :] = end + p.slope * (torch.arange(layout.n_x) == 0)
-    cost = qm.Cost(W, last, hessian="block", q=q)
-    return qm.Scheme(layout, model, cost, bounds, gamma)
-
-
 def designed(
     plant: Priced,
     found: Identified,
@@ -259,11 +230,30 @@ def designed(
     effort: float = 1.0,
     learn: tuple[str, ...] = ("q",),
 ) -> qm.QPMPC:
-    """Return MPC of the estimate by an identified model, without discount."""
-    m = found.model
-    model = qm.Model(*(torch.tensor(x) for x in (m.A, m.B, m.E, m.offset)))
-    made = scheme(plant.observed(m), model, 1.0, moved, effort)
-    learn = (*learn, *(("lb",) if plant.price.price else ()))
+    """Return MPC of the estimate by an identified model, without discount.
+
+    Its set-point is moved by so much, and the input's weight is ``effort`` times the plant's.
+    """
+    A, B, E, offset = map(torch.tensor, found.model[:4])
+    seen, p = plant.observed(found.model), plant.price
+    layout = plant_layout(seen, HORIZON)
+    r, weight = p.r + moved, torch.zeros(layout.n).double()
+    weight[0], weight[-1] = 2 * p.weight + p.above, 2 * effort * p.effort
+    q, lower = torch.zeros_like(weight), torch.full((layout.n_x,), -math.inf).double()
+    q[0] = p.slope - weight[0] * r
+    soft: dict[str, Any] = {}
+    if p.price:
+        lower[0], learn = r, (*learn, "lb")
+        soft = {"state_bounds": (lower, torch.full_like(lower, math.inf)), "state_slack": p.price}
+    bounds = qm.Bounds(action_bounds=(plant.lb_a, plant.ub_a), discount_slack=True, **soft)
+    q = q.repeat(HORIZON + 1)[: layout.n_z]
+    W, aim = torch.diag(weight), torch.zeros_like(weight)
+    aim[0] = -weight[0] * r  # the cost to go of the regulator about r
+    last = riccati_weight(A, B, W, 1.0)
+    end, _ = affine_cost_to_go(A, B, offset, W, aim, last, 1.0)
+    q[-layout.n_x :] = end + p.slope * (torch.arange(layout.n_x) == 0)
+    cost = qm.Cost(W, last, hessian="block", q=q)
+    made = qm.Scheme(layout, qm.Model(A, B, E, offset), cost, bounds, 1.0)
     return qm.QPMPC(made, learn=learn, structure="tied", solver="daqp")
 
 
@@ -367,47 +357,8 @@ def tuned(plant: Priced, found: Identified, simulated: Any, std: float, seed: in
     return designed(plant, found, std * best[0], 10 ** best[1])
 
 
-OPTIONS = {"solver": "daqp", "num_envs": 10, "steps_per_update": 4, "warmup_steps": 4}
-OPTIONS |= {"gate": False, "figures": False, "rivals": False, "logger": "csv"}
-OPTIONS |= {"defaults": [{"override /constraint": "identified"}, {"override /start": "data"}]}
-TASK = {"horizon": HORIZON, "gamma": 0.95, "episode_steps": EPISODE, "eval_steps": STEPS}
-TASK |= {"hessian": "block", "discount_slack": True, "learn_cost": ["H", "H_f", "q", "c"]}
-
-
-def own_scheme(cfg: Any, plant: Priced) -> qm.Scheme:
-    return scheme(plant, qm.Model(), cfg.task.gamma, 0.0, 1.0)
-
-
-for _name, _plant in PLANTS.items():
-    register(
-        Task(
-            f"rivals_{_name.lower()}",
-            lambda cfg, plant=_plant: plant,
-            own_scheme,
-            defaults={**OPTIONS, "task": TASK},
-        )
-    )
-
-
-def q_learning(name: str, transitions: int, seed: int) -> tuple[qm.QPMPC, Any]:
-    """Return what train.py learns from half the transitions as its log and the others, one by one.
-
-    The model of its log is that of the filter.
-    """
-    half = transitions // 2
-    options = {"seed": seed, "start.transitions": half, "updates": half // 40 - 1}
-    options |= {"eval_interval": half // 40 - 1, "replay_capacity": 2 * half}
-    cfg = make_config(f"task=rivals_{name.lower()}", *(f"{key}={x}" for key, x in options.items()))
-    with tempfile.TemporaryDirectory() as folder:
-        train.train(cfg, folder, quiet=True)
-        log = stored_log(Path(folder) / LOG)
-        return qm.load_run(folder).policy, qm.identify(log, HORIZON).fit.model
-
-
 DESIGNS = ("mean", "Riccati", "moved", "expanded", "two numbers")
-DESIGNS += ("improve", "improve, H", "Q-learning")
-#: The designs of the page; Q-learning takes hours.
-SHOWN = DESIGNS[:-1]
+DESIGNS += ("improve", "improve, H")
 #: What the designs by gradients learn, besides soft bounds.
 LEARNED = {"improve": ("q",), "improve, H": ("q", "H", "H_f")}
 #: The rows of what they keep.
@@ -441,9 +392,6 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
             mpc = designed(plant, found, learn=LEARNED[design])
             policy, options = mpc.policy, IMPROVE | {"seed": seed}
             kept = qm.improve(mpc, found, cost=price, **options).kept
-        elif design == "Q-learning":
-            mpc, model = q_learning(name, size, seed)
-            policy = mpc.policy
         seconds, seen = round(time.process_time() - began, 1), plant.observed(model)
         loop = closed_loop(policy, seen, steps=LONG, starts=LOOPS, seed=EVALUATION + seed)
         names = {"plant": name, "transitions": size, "seed": seed, "design": design}
@@ -502,7 +450,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.rivals")
     parser.add_argument("--plants", nargs="+", choices=PLANTS, default=[*PLANTS])
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=SHOWN)
+    parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=DESIGNS)
     options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
