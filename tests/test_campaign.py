@@ -11,7 +11,7 @@ from tests.campaign.families import FAMILIES, Draw, solvable, well_posed
 from tests.campaign.outcomes import judge
 from tests.campaign.rounding import answers, differences, drawn
 from tests.campaign.rounding import main as compare_rounding
-from tests.campaign.tally import Tally
+from tests.campaign.tally import Tally, alone
 from tests.campaign.trained import trained
 from torch_qpmpc import Status, solve_qp
 from torch_qpmpc.qp.solution import QPSolution
@@ -43,18 +43,36 @@ def test_no_qp_is_called_what_it_is_not_and_a_seed_repeats_it(family, solver):
     assert tally.certified + tally.named + tally.missed == tally.count
 
 
-def test_hard_rows_implied_by_C_are_not_infeasible():
-    # Rounding in such rows of the condensed problem once looked like a contradiction.
-    case = FAMILIES["dependent rows"](Draw(2000003), 128)
-    solution = solve_qp(case.known.qp, case.known.fixed, solver="torch", on_failure="mask")
-    assert judge(case, solution).certified.all()
-
-
-def test_plans_that_run_away_are_solved_on_their_active_sets():
-    # The interior point alone left 3 of these within 1e-7, and refinement none of them.
-    case = FAMILIES["runaway prediction"](Draw(300012), 16)
-    solution = solve_qp(case.known.qp, case.known.fixed, solver="daqp", on_failure="mask")
-    assert judge(case, solution).certified.all()
+@pytest.mark.parametrize(
+    ("family", "seed", "count", "solver", "only"),
+    [
+        # Rounding in hard rows that C implies once looked like a contradiction.
+        ("dependent rows", 2000003, 128, "torch", None),
+        # A basis of rows whose sine was just above 1e-14 made an exact answer's error 36.
+        ("dependent rows", 3, 128, "torch", None),
+        # The interior point alone left 3 of these within 1e-7, and refinement none of them.
+        ("runaway prediction", 300012, 16, "daqp", None),
+        # Errors of the value are infinite for rows that agree up to a solver's tolerance: those of
+        # the torch method's answers are large, of the fallback's small.
+        ("previews", 0, 128, "daqp", None),
+        ("singular H", 1, 32, "torch", None),
+        ("infeasible", 6, 128, "daqp", 70),  # rows that contradict each other by 1e-4
+        ("infeasible", 4, 16, "daqp", 2),
+        ("infeasible", 153, 16, "daqp", 0),  # ... and lead far away to another
+        ("unbounded", 42, 16, "daqp", 5),  # a slope of 1 on curvatures of 1 and 0
+        ("unbounded", 74, 16, "daqp", 6),
+        ("scaled mixed", 108, 16, "daqp", 4),
+        ("hopeless plant", 6, 16, "daqp", 0),  # C z = b only 1e8 times as far away as the bounds
+    ],
+)
+def test_what_was_once_not_solved_has_its_status(family, seed, count, solver, only):
+    """Of a batch, or ``only`` one of its QPs, alone."""
+    case = FAMILIES[family](Draw(seed), count)
+    qp, expected = (case.known.qp, case.known.fixed), case.expected
+    if only is not None:
+        qp, expected = alone(case, only), expected[only]
+    solution = solve_qp(*qp, solver=solver, on_failure="mask")
+    assert solution.status.tolist() == expected.tolist()
 
 
 def test_terms_that_cancel_are_the_unit_of_their_value():

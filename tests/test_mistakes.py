@@ -182,6 +182,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("gamma: got 2.0, expected a discount", lambda: closed_loop(two, pm).discounted(2.0)),
     ("policy: got PointMass, expected a function. Pass a", lambda: closed_loop(pm, mpc.policy)),
     ("plant: got QPMPC, expected a LinearSystem, a Plant or a", lambda: closed_loop(two, mpc)),
+    ("num_envs: got 0, expected a whole number >= 1.", lambda: LinearSystemEnv(pm, 0)),
     ("max_steps: got 1.5, expected a whole number >= 1.", lambda: LinearSystemEnv(pm, 2, 1.5)),
     ("dtype: got torch.int64, expected a", lambda: LinearSystemEnv(pm, dtype=torch.int64)),
     (f"seed: got {2**64}, expected a whole", lambda: LinearSystemEnv(pm).set_seed(2**64)),

@@ -20,7 +20,6 @@ from torch_qpmpc.envs import (
     PlantEnv,
     PointMass,
 )
-from torch_qpmpc.errors import QPError
 
 
 def observed(*arguments: Any, **options: Any) -> Any:
@@ -143,11 +142,3 @@ def test_partial_resets_in_a_collector_restart_exactly_the_finished_episodes(kin
         increments = data["next", "noise"] - data["noise"]
         assert increments.std().item() == pytest.approx(0.1, rel=0.05)
         assert data["next", "noise"].std().item() > 0.13
-
-
-@pytest.mark.parametrize(
-    ("sizes", "said"), [((0, 5), "num_envs: got 0"), ((1, -1), "max_steps: got -1")]
-)
-def test_bad_sizes_are_an_error(make, sizes, said):
-    with pytest.raises(QPError, match=f"{said}, expected a whole number >= 1"):
-        make(*sizes)

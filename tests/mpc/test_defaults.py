@@ -8,13 +8,12 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.logs import arx_log
-from torch_qpmpc import QPMPC, QPError
+from torch_qpmpc import QPMPC
 from torch_qpmpc.mpc.riccati import riccati_weight
 
 A = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double()
 B = torch.tensor([[0.0], [0.1]]).double()
 W = torch.tensor([[1.0, 0.1, 0.0], [0.1, 0.5, 0.0], [0.0, 0.0, 0.1]]).double()
-UNCHOSEN = r"stage_weight: got none, expected the weight .* such as stage_weight=\[1.0, 1.0, 0.1\]"
 
 
 # The terminal weight
@@ -61,12 +60,6 @@ def test_a_reference_in_the_preview_is_reached(horizon):
 
 
 # The stage cost
-
-
-def test_a_controller_without_a_cost_is_refused():
-    for options in ({}, {"stage_weight": None}):
-        with pytest.raises(QPError, match=f"^{UNCHOSEN}"):
-            QPMPC.from_model(A, B, 3, **options)
 
 
 def rewarded() -> tuple[TensorDict, torch.Tensor]:

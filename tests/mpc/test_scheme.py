@@ -82,7 +82,10 @@ def test_the_identity_has_the_sizes():
 
 @refused(
     (lambda: make(gamma=0.0), r"gamma: got 0.0, expected a discount factor in \(0, 1\]"),
-    (lambda: QPMPC(make(cost=Cost())), "stage_weight: got none, expected the weight of"),
+    (
+        lambda: QPMPC(make(cost=Cost())),
+        r"stage_weight: got none, expected the weight of .* such as stage_weight=\[1.0, 1.0, 0.1\]",
+    ),
     (lambda: QPMPC(make(model=Model())), r"A, B: got None, expected the model x\+ = A x \+ B u, m"),
     (lambda: make(layout=(2, 1, 4)), "layout: got tuple, expected a Layout"),
     (lambda: QPMPC((2, 1, 3)), "scheme: got tuple, expected a Scheme. QPMPC.from_model takes"),  # pyright: ignore[reportArgumentType] - the mistake

@@ -120,11 +120,10 @@ def test_the_set_lies_about_the_equilibrium(one_gain):
             ),
             "a set without a part that is proved invariant",
         ),
-        (lambda: invariant_set(bounded(0.01, 100.0), PLANT, BOX), "proved invariant"),
         (lambda: invariant_set(scheme(), PLANT, Polytope.box([0.0], [1.0])), "n_p = 2"),
         (lambda: invariant_set(scheme(), Plant.of([[1.0]], [[1.0]]), BOX), "plant.B"),
     ],
-    ids=["unstable", "disturbed", "no scale", "states", "plant"],
+    ids=["unstable", "disturbed", "states", "plant"],
 )
 def test_errors(ask, sentence, one_gain):
     with pytest.raises(QPError) as raised:

@@ -103,29 +103,9 @@ def test_bounds_that_cross_by_rounding_are_accepted_as_equal(dtype):
     assert crossed(up + 1e-3, known.qp.ub).all()
 
 
-def test_infinite_bounds_and_weights_are_accepted():
-    qp = known_qp(0, soft=("free", "no_upper"), hard=("no_upper",)).qp
-    assert qp.lb.isinf().any()
-    assert qp.ub.isinf().any()
-    assert qp.w.isinf().any()
-
-
-@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
-def test_batch_shape_is_that_of_the_broadcast_tensors(batch):
-    qp = known_qp(0, batch=batch).qp
-    assert qp.H.ndim == 2
-    assert qp.batch_shape == torch.Size(batch)
-
-
 def test_batch_shape_counts_every_tensor():
     changes = {"c": torch.zeros(3, 1).double(), "q": GOOD["q"].expand(4, -1)}
     assert QuadraticProgram(**(GOOD | changes)).batch_shape == (3, 4)
-
-
-def test_tensors_come_in_the_order_of_the_constructor():
-    qp = QuadraticProgram(**GOOD)
-    again = QuadraticProgram(*qp.tensors(), check_values=False)
-    assert all(getattr(again, name) is tensor for name, tensor in GOOD.items())
 
 
 def test_a_program_cannot_be_changed():

@@ -7,8 +7,6 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.campaign.families import FAMILIES, Draw
-from tests.campaign.tally import alone
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of, random_mpc
 from torch_qpmpc import QPMPC, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
@@ -197,25 +195,6 @@ def test_matrices_of_its_own_for_each_element():
     )
     expected = [Status.INFEASIBLE, Status.UNBOUNDED, Status.NOT_CONVERGED]
     assert diagnose(programs(qp)).tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("family", "count", "seed", "index"),
-    [
-        ("infeasible", 128, 6, 70),  # rows that contradict each other by 1e-4
-        ("infeasible", 16, 4, 2),
-        ("infeasible", 16, 153, 0),  # ... and lead far away to another
-        ("unbounded", 16, 42, 5),  # a slope of 1 on curvatures of 1 and 0
-        ("unbounded", 16, 74, 6),
-        ("scaled mixed", 16, 108, 4),
-        ("hopeless plant", 16, 6, 0),  # the least z with C z = b is 1e8 times as far as the bounds
-    ],
-)
-def test_qps_formerly_not_converged_have_their_proof(family, count, seed, index):
-    case = FAMILIES[family](Draw(seed), count)
-    qp, fixed = alone(case, index)
-    solution = solve_qp(qp, fixed, solver="daqp", on_failure="mask")
-    assert solution.status == case.expected[index]
 
 
 #: Settings with soft states and hard action bounds, feasible and bounded for every state.
