@@ -1,4 +1,4 @@
-"""Each example in docs/examples learns, by the command that its page names."""
+"""Each example in docs/examples learns, by the command that its page names or for a few updates."""
 
 import math
 import runpy
@@ -12,6 +12,7 @@ from tests.runs import run_command
 from torch_qpmpc.experiment.run_folder import read_summary
 from torch_qpmpc.experiment.tasks import TASKS
 
+SCRIPTS = FOLDER / "torchrl"
 SHORT = (
     *("updates=2", "eval_interval=2", "log_interval=1", "warmup_steps=10", "batch_size=16"),
     *("task.eval_steps=3", "rivals=true", "replay_capacity=8000", "gate=false"),
@@ -59,3 +60,25 @@ def test_the_figure_of_bad_hours_shows_what_prediction_and_observation_save():
     for loops in (drawn["dropout"](), drawn["transfer"]()):
         better, worse = (np.square(rows[:, 0] - rows[:, 2]).sum() for rows in loops.values())
         assert better < 0.8 * worse
+
+
+#: The scripts of the actor-critic page, of one plant each: all make either in the same way.
+RUNS = (
+    ("ddpg", 3, None),
+    ("td3", 3, "here:Pendulum-v1"),
+    ("sac", 3, "Pendulum-v1"),
+    ("ppo", 1, None),
+)
+
+
+@pytest.mark.filterwarnings("ignore:The env passed to Collector", "ignore:.*rewards")
+@pytest.mark.parametrize(("name", "updates", "id"), RUNS)
+def test_a_script_of_at_most_60_lines_learns(monkeypatch, tmp_path, name, updates, id):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    (tmp_path / "here.py").touch()  # a module of the current folder
+    monkeypatch.chdir(tmp_path)
+    path = SCRIPTS / f"{name}.py"
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
+    before, after = runpy.run_path(str(path))["main"](updates, id=id)
+    assert math.isfinite(after)
+    assert after != before
