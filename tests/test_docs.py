@@ -24,8 +24,9 @@ EXAMPLES = sorted(
 )
 
 #: README.md learns by TorchRL in small, test_start.py from a log; tests/proofs asks smaller QPs,
-#: and the tests of `improve` have shorter loops.
-SLOW = [f"docs/guides/{x}.md" for x in ("torchrl", "environment", "prove", "closed-loops")]
+#: and the tests of `improve` and of nonlinear plants have shorter loops.
+SLOW = ("torchrl", "environment", "prove", "closed-loops", "scheduling")
+SLOW = [f"docs/guides/{x}.md" for x in SLOW]
 
 
 @pytest.mark.usefixtures("rough_fits")

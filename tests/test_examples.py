@@ -62,12 +62,12 @@ def test_the_figure_of_bad_hours_shows_what_prediction_and_observation_save():
         assert better < 0.8 * worse
 
 
-#: The scripts of the actor-critic page, of one plant each: all make either in the same way.
+#: The scripts of the actor-critic page, two of them quick; all make either plant in the same way.
 RUNS = (
     ("ddpg", 3, None),
-    ("td3", 3, "here:Pendulum-v1"),
-    ("sac", 3, "Pendulum-v1"),
-    ("ppo", 1, None),
+    pytest.param("td3", 3, None, marks=pytest.mark.slow),
+    ("sac", 3, "here:Pendulum-v1"),
+    pytest.param("ppo", 1, "Pendulum-v1", marks=pytest.mark.slow),
 )
 
 

@@ -13,6 +13,7 @@ from tests.refused import refused
 from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control import learning
 
+pytestmark = pytest.mark.usefixtures("rough_fits")
 WRONG, RIGHT = ([[0.6]], [[0.2]]), ([[0.9]], [[0.5]])
 QUICK = {"r": [0.5], "spread": 0.5, "steps": 8, "transitions": 120}
 

@@ -265,6 +265,7 @@ def slow(hold: int, step: float = 0.0) -> dict[str, np.ndarray]:
     return {"y1": y[np.arange(200) // 5 * 5, 0], "y2": y[:, 1], "u": u}
 
 
+@pytest.mark.usefixtures("rough_fits")
 def test_the_repeats_of_a_slow_sensor_are_missing():
     """They made it a random walk in short logs."""
     with pytest.warns(UserWarning, match="y1 has a new value every 5 rows: its repeats are taken"):

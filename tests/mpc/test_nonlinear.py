@@ -232,8 +232,10 @@ def test_a_bound_holds_a_concave_cost_in_all_units(unit):
     assert slope.item() == pytest.approx(4.0)
 
 
-@pytest.mark.parametrize("hard", [True, False])
-@pytest.mark.parametrize("units", [(1e-6, 1e5, 1e4), (1e5, 1e-6, 1.0), (1.0, 1e4, 1e-8)])
+@pytest.mark.parametrize(
+    ("units", "hard"),
+    [((1e-6, 1e5, 1e4), True), ((1e5, 1e-6, 1.0), False), ((1.0, 1e4, 1e-8), True)],
+)
 def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):
     bounds = {"state_bounds": ([-1.0, -2.0], [3.0, 2.0]), "action_bounds": ([-1.5], [1.5])}
     s = torch.tensor([[2.5, 0.0], [0.5, -1.0], [-0.9, 0.2]], dtype=torch.float64)

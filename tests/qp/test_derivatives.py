@@ -304,10 +304,12 @@ def assert_derivatives_at_the_origin(program: Family, solver: str) -> None:
 ROW = normal(1, 5, seed=2)
 
 
-@SOLVERS
-@pytest.mark.parametrize("w", [INF, 50.0], ids=["hard", "soft"])
-@pytest.mark.parametrize("shift", [0.0, 1.0], ids=["no_multiplier", "multiplier"])
+@pytest.mark.parametrize(
+    ("solver", "w", "shift"),
+    covering(itertools.product(("proxqp", "daqp", "torch"), (INF, 50.0), (0.0, 1.0))),
+)
 def test_a_row_with_equal_bounds_is_an_equality(solver, w, shift):
+    """Hard or soft, with a multiplier or without."""
     rows = torch.cat((ROW, torch.eye(5, dtype=torch.float64)[2:]))
     bounds = [0.0, -1.0, -1.0, -1.0], [0.0, 1.0, 1.0, 1.0]
     weights = [w, INF, 5.0, INF]
