@@ -356,9 +356,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.nonlinear", description="Write the tables of rivals."
     )
-    kinds = ["log", "model", *AGENTS]
     parser.add_argument("--plants", nargs="*", default=[*PLANTS, *CONVERSE])
-    parser.add_argument("--rows", nargs="*", default=kinds, choices=kinds)
     parser.add_argument("--count", type=int, default=20_000, help="transitions of TD3 and SAC")
     options = options_of(parser, arguments, SEEDS, RESULTS, outside.PAGE)
     torch.set_num_threads(1)
@@ -370,11 +368,11 @@ def main(arguments: Iterable[str] | None = None) -> None:
         if plant in CONVERSE:
             optimum(rows)
             continue
-        if "log" in options.rows and not rows.has(OURS):
+        if not rows.has(OURS):
             from_log(rows)
-        if "model" in options.rows and seed == SEEDS[0]:
+        if seed == SEEDS[0]:
             true_model(rows)
-        for kind in {*AGENTS} & {*options.rows}:
+        for kind in AGENTS:
             if not rows.has(kind, options.count):
                 policy = agent(kind, outside.PLANTS[name].id, seed, options.count)
                 rows.add(kind, options.count, lambda policy=policy: policy, rows.physics)
