@@ -34,7 +34,7 @@ BUDGET = {
     "export": 1431,
     "learning": 2791,  # models that did not train theta decide in improve
     "identification": 2642,  # dead times beyond the orders are told
-    "mpc": 3819,
+    "mpc": 3831,
     "proofs": 1001,
     "qp": 5295,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
