@@ -13,7 +13,14 @@ import torch_qpmpc as qm
 from torch_qpmpc.identification import subspace
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.identification.likelihood import Noisy, Signals, em, groups_of, smooth
+from torch_qpmpc.identification.likelihood import (
+    Noisy,
+    Signals,
+    em,
+    groups_of,
+    likeliest,
+    smooth,
+)
 
 
 def tank(rows: int, hold: int, seed: int, start: float = 0.0, noise: float = 0.05) -> dict:
@@ -66,6 +73,47 @@ def test_the_order_of_a_short_log_in_one_piece_is_enough(log, new, order):
     assert order <= found.fit.order
     assert off(found, new) < 1.2 * off(told, new)
     assert found.R2[-1].item() > 0.99 * (1 - off(told, new) ** 2 / log["y"].var())
+
+
+def loaded(seed: int, pole: float, walk: float, rows: int = 1500) -> dict[str, np.ndarray]:
+    """Two lags with gains [[1, .5], [0, 1]], whose loads forget 1 - ``pole`` a step."""
+    rng = np.random.default_rng(seed)
+    x, load, a, y, u = np.zeros(2), np.zeros(2), np.array([0.6, 0.8]), [], []
+    for _ in range(rows):
+        u.append(rng.uniform(-1, 1, 2))
+        y.append(x + rng.normal(0, 0.02, 2))
+        load = pole * load + rng.normal(0, walk, 2)
+        x = a * x + (1 - a) * ([[1, 0.5], [0, 1]] @ u[-1] + load)
+    y, u = np.array(y), np.array(u)
+    return {"y1": y[:, 0], "y2": y[:, 1], "u1": u[:, 0], "u2": u[:, 1]}
+
+
+def gain(model: Innovations) -> np.ndarray:
+    """Return the steady gain."""
+    return model.C @ np.linalg.solve(np.eye(len(model.A)) - model.A, model.B)
+
+
+@pytest.mark.parametrize(("pole", "walk"), [(0.9, 0.1), (1.0, 0.01)])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_steady_gain_is_the_plants_where_the_level_drifts(pole, walk, seed):
+    """The inputs seemed to move the drift a little: with its time, gains were off by up to 7."""
+    log = loaded(seed, pole, walk)
+    read = qm.read_log(log, outputs=["y1", "y2"], inputs=["u1", "u2"])
+    found = qm.identify(read)
+    np.testing.assert_allclose(gain(found.fit.model), [[1, 0.5], [0, 1]], atol=0.1)
+    assert f"of which no input moves {found.fit.drifts}" in str(found)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_a_slow_mode_that_inputs_move_is_none_of_the_drifts(noise):
+    """Its gain is known to the accuracy of a log of three of its times."""
+    rng, x, y, u = np.random.default_rng(1), 0.0, [], []
+    for k in range(600):
+        u.append(u[-1] if k % 20 else rng.uniform(-1, 1))
+        y.append(x + noise * rng.normal())
+        x = 0.995 * x + 0.01 * u[-1]
+    model = qm.identify({"y": np.array(y), "u": np.array(u)}).fit.model
+    assert abs(gain(model)[0, 0] - 2) < 0.3
 
 
 def late_log(delay: int, noise: float) -> dict[str, np.ndarray]:
@@ -194,20 +242,42 @@ def likelihood(par: Noisy, data: list[Signals]) -> float:
     return sum(smooth(par, group).likelihood for group in groups_of(data))
 
 
-def test_longer_steps_raise_the_likelihood_faster():
+def oscillation() -> tuple[Noisy, list[Signals]]:
+    """Return a start and the log of an oscillation, whose first state is measured."""
     rng, A, x = np.random.default_rng(2), np.array([[0.95, 0.2], [-0.2, 0.95]]), np.zeros(2)
     y, u = np.zeros((300, 1)), rng.normal(size=(299, 1))
     for k in range(300):
         y[k] = x[0] + 1e-3 * rng.normal()
         x = A @ x + ([0.0, 1.0] * u[k] if k < 299 else 0) + 0.1 * rng.normal(size=2)
-    data, rest = [Signals(y, u)], (np.eye(1, 2), np.eye(2), np.eye(1), np.zeros(2), np.eye(2))
-    start = Noisy(0.7 * A, np.ones((2, 1)), *rest)
+    rest = np.eye(1, 2), np.eye(2), np.eye(1), np.zeros(2), np.eye(2)
+    return Noisy(0.7 * A, np.ones((2, 1)), *rest), [Signals(y, u)]
+
+
+def test_longer_steps_raise_the_likelihood_faster():
+    start, data = oscillation()
     values = [likelihood(em(start, data, count, 1.2), data) for count in (0, 5, 10, 20, 30)]
     assert np.all(np.diff(values) > 0)
     assert values[-1] > likelihood(em(start, data, 30), data) + 4
     gained = values[-1] - values[0]
     assert em(start, data, 30, 1.2, 1.01 * gained / 300) is start
     assert em(start, data, 30, 1.2, 0.99 * gained / 300) is not start
+
+
+def test_the_likeliest_model_is_at_a_maximum():
+    start, data = oscillation()
+    value, found = likeliest(start, data)
+    assert likelihood(found, data) >= value > likelihood(em(start, data, 200, 1.2), data)
+    for name, part in found._asdict().items():
+        for change in (1 - 1e-3, 1 + 1e-3):
+            assert likelihood(found._replace(**{name: change * part}), data) < value + 0.01
+
+
+def test_a_model_that_overflows_has_no_likelihood():
+    start, data = oscillation()
+    broken = start._replace(A=np.full((2, 2), np.nan))
+    value, found = likeliest(broken, data)
+    assert value == -np.inf
+    assert found is broken
 
 
 def test_a_likelier_model_that_predicts_worse_far_ahead_is_not_taken():

@@ -127,10 +127,11 @@ class Identified:
         poles = ", ".join(f"{abs(pole):.3g}" for pole in self.fit.model.poles)
         white = ", ".join(f"{share:.0%}" for share in whiteness(self.model, log.trajectories))
         n = {row.order for row in equal_candidates(self.fit.candidates)} or {0}
+        drifts = f", of which no input moves {self.fit.drifts}" * bool(self.fit.drifts)
         equal = f"; orders {min(n)} to {max(n)} are as good within their error" * (len(n) > 1)
         lines = [
             str(log),
-            f"Model of order {len(self.fit.model.A)} with poles of sizes {poles}{equal}",
+            f"Model of order {len(self.fit.model.A)} with poles of sizes {poles}{drifts}{equal}",
             f"Autocorrelations of the residuals in their 95 % bound: {white}",
         ]
         shares = explained_by_inputs(self.model, log.trajectories)
@@ -165,6 +166,8 @@ def identify(
     n_x: int | None = None,
 ) -> Identified:
     """Fit a linear state-space model with its noise to logged trajectories.
+
+    Slow modes that the inputs are not shown to move are drifts: no input moves them.
 
     Args:
         trajectories: a `Log`, or what `read_log` takes; or logged steps, ``(T,)`` or ``(episodes,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,11 @@ from torch_qpmpc.identification.innovations import Innovations
 
 #: The gain of the log-likelihood per step that ends expectation maximisation.
 STALLED = 1e-4
+#: A real mode this near to one may be a drift, which forgets at least the share FORGETS a step.
+SLOW, FORGETS = 0.2, 1e-3
+#: The level of the test that inputs move a mode; extrapolations of its fits, and the gain per step
+#: that ends them.
+LEVEL, CYCLES, LEFT = 0.01, 100, 1e-6
 #: The least variances of the noise of normalised states and outputs.
 FLOOR_Q, FLOOR_R = 1e-12, 1e-8
 
@@ -107,17 +112,110 @@ def em(
             break
         factor, par = factor * growth, plain
         if factor > 1:
-            far = Noisy(*(x + factor * (z - x) for x, z in zip(last, plain, strict=True)))
-            parts = {"Q": FLOOR_Q, "R": FLOOR_R, "P0": FLOOR_Q}
-            par = far._replace(**{k: _positive(getattr(far, k), w) for k, w in parts.items()})
+            par = _possible(x + factor * (z - x) for x, z in zip(last, plain, strict=True))
     return plain if before >= least else first
 
 
-def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
+def _possible(parts: Iterable[Array]) -> Noisy:
+    """Return a model of these parts, with covariances of at least the floors."""
+    far = Noisy(*parts)
+    least = {"Q": FLOOR_Q, "R": FLOOR_R, "P0": FLOOR_Q}
+    return far._replace(**{k: _positive(getattr(far, k), w) for k, w in least.items()})
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # of leaps that diverge
+def likeliest(par: Noisy, data: Sequence[Signals], drifts: int = 0) -> tuple[float, Noisy]:
+    """Return a maximum of the likelihood, and its model.
+
+    Two iterations of expectation maximisation tell how far to go on in their direction (SQUAREM,
+    Varadhan and Roland 2008). Only noise of their own moves the last ``drifts`` states.
+    """
+    groups, least = groups_of(data), LEFT * sum(len(y) for y, _ in data)
+
+    def step(parts: Iterable[Array]) -> tuple[float, Noisy]:
+        try:
+            moments = [smooth(_possible(parts), group) for group in groups]
+            if np.isfinite(value := sum(m.likelihood for m in moments)):
+                return value, _maximise(groups, moments, drifts)
+        except np.linalg.LinAlgError:  # of numbers that overflowed
+            pass
+        return -np.inf, par
+
+    one, longest, (value, two) = par, 1.0, step(par)
+    for _ in range(CYCLES):
+        between, three = step(two)
+        first = [y - x for x, y in zip(one, two, strict=True)]
+        bend = [z - y - x for x, y, z in zip(first, two, three, strict=True)]
+        length = np.sqrt(sum((x**2).sum() for x in first) / sum((x**2).sum() for x in bend))
+        length = max(1.0, min(length, longest))
+        parts = zip(one, first, bend, strict=True)
+        far = [x + 2 * length * y + length**2 * z for x, y, z in parts]
+        found, longest = step(far), longest * (4.0 if length == longest else 1.0)
+        if not found[0] >= between:
+            far, found, longest = three, step(three), max(longest / 4.0, 1.0)
+        if not found[0] - value >= least:
+            break
+        one, (value, two) = far, found
+    return value, two
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of an unstable model
+def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
+    """Make drifts of slow modes that the inputs are not shown to move; return model and number.
+
+    What chance gives an input on a slow mode is a large steady gain, of either sign. The likelihood
+    ratio decides for a mode, or a pair, at a time. Drifts, no more than outputs, are the last
+    states, which noise alone moves.
+    """
+    drifts, n_y = 0, len(par.C)
+    least = scipy.stats.chi2.isf(LEVEL, par.B.shape[1] * np.arange(1, n_y + 1)) / 2
+    most, full = likeliest(par, data)
+    while drifts < n_y:
+        own, found = len(par.A) - drifts, []
+        for modes in _slow_modes(full.A[:own, :own]):
+            if (count := drifts + len(modes)) <= n_y:
+                value, one = likeliest(_with_drifts(full, modes), data, count)
+                found.append((value + least[len(modes) - 1], value, count, one))
+        shown, value, count, one = max(found, default=(-np.inf, 0.0, 0, par), key=lambda x: x[0])
+        if not shown >= most:
+            break
+        most, drifts = value, count
+        par = full = one
+    return par, drifts
+
+
+def _slow_modes(A: Array) -> list[Array]:
+    """Return bases ``(1 or 2, n)`` of the left eigenvectors of a mode, or of a pair, near one."""
+    values, left = scipy.linalg.eig(A, left=True, right=False)
+    near = np.flatnonzero((np.abs(values - 1) < SLOW) & (values.imag >= 0))
+    both = ((values[i], left[:, i]) for i in near)
+    return [np.stack((x.real, x.imag) if value.imag else (x.real,)) for value, x in both]
+
+
+def _with_drifts(par: Noisy, modes: Array) -> Noisy:
+    """Return the model with ``modes`` of the first states as drifts, before those that it has.
+
+    The noise of a drift is its own: what it shares with a state moves this through it.
+    """
+    n, (count, m) = len(par.A), modes.shape
+    own, Q = np.arange(m - count, m), par.Q[:m, :m]
+    T = np.eye(n)
+    T[:m, : m - count] = np.linalg.qr(modes.T, mode="complete")[0][:, count:]
+    T[:m, own] = np.linalg.solve(modes @ Q @ modes.T, modes @ Q).T  # modes @ it is one
+    back = np.linalg.inv(T)
+    A, B, Q = back @ par.A @ T, back @ par.B, back @ par.Q @ back.T
+    kept = np.minimum(A[own, own], 1 - FORGETS)
+    A[own], B[own] = 0.0, 0.0
+    A[own, own] = kept
+    return Noisy(A, B, par.C @ T, Q, par.R, back @ par.m0, back @ par.P0 @ back.T)
+
+
+def _maximise(groups: list[Group], moments: list[Smoothed], drifts: int = 0) -> Noisy:
     """Return the likeliest parameters given the moments of the states.
 
     An output's row of C is fitted to the steps in which it is seen, and an entry of R to those in
-    which both outputs are. To the first states one more is added, anywhere in the log.
+    which both outputs are. To the first states one more is added, anywhere in the log. The last
+    ``drifts`` states are moved by noise of their own alone.
     """
     n, n_y = moments[0].x.shape[-1], groups[0].y.shape[-1]
     Szz: Any = 0.0
@@ -146,7 +244,14 @@ def _maximise(groups: list[Group], moments: list[Smoothed]) -> Noisy:
             both, rows = np.outer(seen, seen), e[:, kind == i].reshape(-1, n_y)
             RR += both * (rows.T @ rows + len(y) * C @ one.total(kind == i) @ C.T)
             M += both * len(rows)
-    Q = _positive((S11 - AB @ Sx1.T) / N, FLOOR_Q)
+    S = S11 - AB @ Sx1.T
+    if drifts:
+        own = np.arange(n - drifts, n)
+        AB[own] = 0.0
+        AB[own, own] = np.minimum(Sx1[own, own] / Szz[own, own], 1 - FORGETS)
+        S = S11 - AB @ Sx1.T - Sx1 @ AB.T + AB @ Szz @ AB.T
+        S[own, : n - drifts], S[: n - drifts, own] = 0.0, 0.0
+    Q = _positive(S / N, FLOOR_Q)
     R = _positive(RR / np.maximum(M, 1), FLOOR_R)
     starts = np.concatenate([m.x[:, 0] for m in moments])
     every = np.concatenate([m.x.reshape(-1, n) for m in moments])

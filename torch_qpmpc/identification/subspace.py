@@ -29,6 +29,7 @@ from torch_qpmpc.identification.likelihood import (
     em,
     starting,
     steady,
+    with_drifts,
 )
 from torch_qpmpc.identification.log import Trajectory, runs
 from torch_qpmpc.identification.ridge import ridge
@@ -54,6 +55,8 @@ SETTLING = 20
 #: so are those that differ by less than ERRORS standard errors and the share MOST. Errors below
 #: EXACT, as a share of the variance, are none.
 MARGIN, ERRORS, MOST, EXACT = 0.004, 2.0, 0.1, 1e-8
+#: Drifts may raise squared errors far ahead, which inputs of chance lower, by the share WORSE.
+WORSE = 0.2
 #: Errors of a model that diverges, in standard deviations.
 WORST = 1e6
 #: Outputs may be unmoved if this share of their measurements repeats the last one; the number of
@@ -87,6 +90,7 @@ class Fit(NamedTuple):
         order, lags: as in `fit_state_space`.
         candidates: those that were compared.
         parts: models that have not seen the outputs of a part of the log each.
+        drifts: the number of modes that no input moves.
     """
 
     model: Innovations
@@ -94,6 +98,7 @@ class Fit(NamedTuple):
     lags: int
     candidates: tuple[Candidate, ...] = ()
     parts: tuple[Innovations, ...] = ()
+    drifts: int = 0
 
 
 def fit_state_space(
@@ -120,16 +125,21 @@ def fit_state_space(
         best = min(equal_candidates(rows), key=lambda row: (row.order, row.score))
         order, lags = best.order, best.lags
         parts = [readable(x, data) if order else x for x in found[rows.index(best)][1]]
-    model = measured(data, filled)
+    model, drifts = measured(data, filled), 0
     if order:
         par = em(_states(_predictor(filled, lags, order), order), data, SOME)
-        likely, model = em(par, data, MANY, GROWTH, GAIN), steady(par)
-        if likely is not par:
-            held, many = _Held(trajectories), steady(likely)
-            model = many if _far(many, data, held) <= _far(model, data, held) else model
-        model = readable(model, data)
+        likely, held = em(par, data, MANY, GROWTH, GAIN), _Held(trajectories)
+
+        def far(one: Noisy) -> float:
+            return _far(steady(one), data, held)
+
+        par = min((likely, par), key=far) if likely is not par else par
+        drifting, count = with_drifts(par, data)
+        if count and far(drifting) <= far(par) + WORSE:
+            par, drifts = drifting, count
+        model = readable(steady(par), data)
     model, *parts = map(normal.restore, (model, *parts))
-    return Fit(model, order or 0, lags, tuple(rows), tuple(parts))
+    return Fit(model, order or 0, lags, tuple(rows), tuple(parts), drifts)
 
 
 def held_out_errors(
