@@ -124,11 +124,14 @@ def _possible(parts: Iterable[Array]) -> Noisy:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # of leaps that diverge
-def likeliest(par: Noisy, data: Sequence[Signals], drifts: int = 0) -> tuple[float, Noisy]:
+def likeliest(
+    par: Noisy, data: Sequence[Signals], drifts: int = 0, goal: float = -np.inf
+) -> tuple[float, Noisy]:
     """Return a maximum of the likelihood, and its model.
 
     Two iterations of expectation maximisation tell how far to go on in their direction (SQUAREM,
-    Varadhan and Roland 2008). Only noise of their own moves the last ``drifts`` states.
+    Varadhan and Roland 2008). It ends where the ``goal`` is out of reach at the pace of the last
+    gain. Only noise of their own moves the last ``drifts`` states.
     """
     groups, least = groups_of(data), LEFT * sum(len(y) for y, _ in data)
 
@@ -153,7 +156,7 @@ def likeliest(par: Noisy, data: Sequence[Signals], drifts: int = 0) -> tuple[flo
         found, longest = step(far), longest * (4.0 if length == longest else 1.0)
         if not found[0] >= between:
             far, found, longest = three, step(three), max(longest / 4.0, 1.0)
-        if not found[0] - value >= least:
+        if not found[0] - value >= max(least, (goal - found[0]) / CYCLES):
             break
         one, (value, two) = far, found
     return value, two
@@ -174,8 +177,9 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
         own, found = len(par.A) - drifts, []
         for modes in _slow_modes(full.A[:own, :own]):
             if (count := drifts + len(modes)) <= n_y:
-                value, one = likeliest(_with_drifts(full, modes), data, count)
-                found.append((value + least[len(modes) - 1], value, count, one))
+                lost = least[len(modes) - 1]
+                value, one = likeliest(_with_drifts(full, modes), data, count, most - lost)
+                found.append((value + lost, value, count, one))
         shown, value, count, one = max(found, default=(-np.inf, 0.0, 0, par), key=lambda x: x[0])
         if not shown >= most:
             break
