@@ -22,7 +22,7 @@ from torch_qpmpc.identification.innovations import Innovations
 
 #: The gain of the log-likelihood per step that ends expectation maximisation.
 STALLED = 1e-4
-#: A real mode this near to one may be a drift, which forgets at least the share FORGETS a step.
+#: A mode, or a pair, this near to one may be a drift. It forgets at least the share FORGETS a step.
 SLOW, FORGETS = 0.2, 1e-3
 #: The level of the test that inputs move a mode; extrapolations of its fits, and the gain per step
 #: that ends them.
@@ -166,7 +166,7 @@ def likeliest(
 def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
     """Make drifts of slow modes that the inputs are not shown to move; return model and number.
 
-    What chance gives an input on a slow mode is a large steady gain, of either sign. The likelihood
+    A slow mode turns an effect of chance into a large steady gain, of either sign. The likelihood
     ratio decides for a mode, or a pair, at a time. Drifts, no more than outputs, are the last
     states, which noise alone moves.
     """
