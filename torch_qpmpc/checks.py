@@ -29,8 +29,7 @@ def check_kind(name: str, value: Any, kind: type, remedy: str = "") -> None:
     """Raise `QPError` unless ``value`` is a ``kind``."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        got = class_name(value)
-        raise QPError.expected(name, got, f"{article} {kind.__name__}", remedy)
+        raise QPError.expected(name, class_name(value), f"{article} {kind.__name__}", remedy)
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
@@ -88,18 +87,13 @@ def check_tensor(
         pairs = zip(event, value.shape[lead:], strict=True)
         fits = all(n == size for n, size in pairs if isinstance(n, int))
     if not fits:
-        raise QPError.expected(
-            name, f"shape {tuple(value.shape)}", f"shape {_shape(event, batched)}", remedy
-        )
+        sizes = [*["*batch"] * batched, *map(str, event)]
+        want = f"shape ({', '.join(sizes)}{',' * (len(sizes) == 1)})"
+        raise QPError.expected(name, f"shape {tuple(value.shape)}", want, remedy)
     if device is not None and value.device != device:
         remedy = f"Move it, or the module: .to({str(value.device)!r})."
         raise QPError.expected(name, f"a tensor on {value.device}", f"one on {device}", remedy)
     return value
-
-
-def _shape(event: tuple[int | str, ...], batched: bool) -> str:
-    parts = [*(["*batch"] if batched else []), *map(str, event)]
-    return f"({', '.join(parts)}{',' if len(parts) == 1 else ''})"
 
 
 def ungraded(name: str, value: Any) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from torch_qpmpc.errors import QPError
@@ -17,6 +18,8 @@ from torch_qpmpc.errors import QPError
 PACKAGED = Path(__file__).with_name("command")
 #: The version of the format that `save_file` writes and `load_file` reads.
 VERSION = 2
+#: What to do about a damaged file of a run.
+RESTORE = "Restore the file, or move the run's folder elsewhere."
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
@@ -31,9 +34,8 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-    except OSError:
+    finally:
         partial.unlink(missing_ok=True)
-        raise
 
 
 def read_tensors(path: Path) -> Any:
@@ -47,8 +49,17 @@ def read_tensors(path: Path) -> Any:
 def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write ``content``, tensors and plain values by name, as a file of a ``kind``."""
     buffer = io.BytesIO()
-    torch.save({"kind": kind, "version": VERSION, **content}, buffer)
+    torch.save({"kind": kind, "version": VERSION, **plain(content)}, buffer)
     write_whole(Path(path), buffer.getbuffer())
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` with Python's numbers and strings in place of NumPy's, which are code."""
+    if isinstance(value, Mapping):
+        return {plain(name): plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(map(plain, value))
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 
 
 def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
@@ -75,12 +86,7 @@ def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
     return content
 
 
-def damaged(
-    file: Path,
-    error: Exception,
-    expected: str,
-    remedy: str = "Restore the file, or move the run's folder elsewhere.",
-) -> QPError:
+def damaged(file: Path, error: Exception, expected: str, remedy: str = RESTORE) -> QPError:
     """Make the error of a ``file``, as of a run, that cannot be read."""
     missing = f"it has no {error.args[0]}" if isinstance(error, KeyError) else ""
     reason = missing or " ".join(str(error).split()) or type(error).__name__

@@ -79,6 +79,22 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
     assert torch.equal(twin.plan.value(p), mpc.plan.value(p))
 
 
+def test_numbers_and_names_of_numpy_are_saved(tmp_path):
+    """A file with one of them could not be read."""
+    one, (q, y, cap, price) = np.float64(1.0), np.array(["q", "T", "cap", "price"])
+    mpc = qm.LinearMPC(
+        ([[0.9]], [[0.1]]), np.int64(3), Q=1.0, references=np.str_("preview"), gamma=0.9 * one,
+        inputs=[q], outputs=[y], known=[cap, price], E=[[0.0, 0.0]],
+        u_bounds={q: (0 * one, cap)}, y_bounds={y: (None, one)}, y_slack={y: one},
+        u_target={q: one}, linear={q: price}, constraints={y: ({q: one, y: one}, (0 * one, one))},
+        u_levels={q: np.arange(3)}, min_on={q: np.int64(2)}, start_cost={q: one},
+        integer_horizon=np.int64(2), max_nodes=np.int64(99),
+    )  # fmt: skip
+    for made in (mpc, qm.Controller(mpc)):
+        made.save(tmp_path / "mine")
+        assert repr(type(made).load(tmp_path / "mine")) == repr(made)
+
+
 def test_later_releases_read_the_format():
     """``python -m tests.control.test_saving`` has written the file."""
     controller = qm.Controller.load(FOLDER / "saved-2.qpmpc")

@@ -232,7 +232,8 @@ def test_a_search_that_ends_early_says_so_with_its_gap():
 
 
 def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):
-    mpc = of(min_on=2, start_cost=0.3, integer_horizon=4)
+    numbers = {"min_on": np.array([2]), "start_cost": np.float64(0.3), "max_nodes": np.int64(99)}
+    mpc = of(**numbers, integer_horizon=4)
     mpc.save(tmp_path / "mpc")
     twin = qm.QPMPC.load(tmp_path / "mpc")
     s = torch.tensor([[1.3], [-2.6]], dtype=torch.float64)

@@ -46,7 +46,7 @@ def identity(mpc: Any) -> dict[str, Any]:
         "discount_slack": mpc.scheme.bounds.discount_slack,
         "learn": {x: digest(mpc._masks[x]) if x in mpc._masks else True for x in mpc.learned},
         "hard rows": digest(mpc.scheme.theta["w"].isinf()),
-        "action_levels": own and repr([*(x.tolist() for x in arrays), own.max_nodes]),
+        "action_levels": own and repr([*(x.tolist() for x in arrays), int(own.max_nodes)]),
         "dynamics": None if mpc.sequential is None else type(mpc.sequential.dynamics).__name__,
     }
 
