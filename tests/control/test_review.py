@@ -258,6 +258,21 @@ def test_a_log_s_means_are_assumed_and_offsets_below_its_noise_are_no_fault():
     assert not controller.review(r=[top + 0.4])["set-points"].ok
 
 
+@pytest.mark.parametrize(
+    ("gains", "lower", "upper"),
+    [
+        ([1.0, 2.0, 2.0], [-1.0, None, None], [1.0, None, 2.0]),
+        ([0.0, 2.0, -3.0], [None, -1.0, None], [None, 2.0, None]),
+        ([3.0, -1.0, 3.0], [-2.0, None, None], [1.0, None, 1.0]),
+    ],
+)
+def test_a_reach_without_an_end_is_no_fault(gains, lower, upper):
+    """HiGHS called the search for the end infeasible, so that no input seemed to hold the plant."""
+    finding = made(([[0.4]], [gains]), dR=1.0, y_bounds=None, u_bounds=(lower, upper), r=[1.0])
+    assert finding["set-points"].ok
+    assert finding["set-points"].numbers["y1 reaches"].tolist() == [-np.inf, np.inf]
+
+
 def test_outputs_reach_what_the_zones_of_others_leave():
     """y2, without a weight, moves with y1."""
     model = ([[0.9]], [[0.5]], [[1.0], [0.5]])

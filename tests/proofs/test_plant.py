@@ -7,6 +7,8 @@ from torch_qpmpc import QPError
 from torch_qpmpc.proofs import Polytope
 
 TRIANGLE = [[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 1.0]
+#: Rows of an unbounded set, which a presolver took for an empty one.
+CONE = [[-2.0, 0.0, 0.0], [0.0, -2.0, 0.0], [-2.0, -1.0, 2.0], [1.0, 1.0, -2.0]]
 
 
 def test_a_triangle_has_its_box_and_vertices():
@@ -34,6 +36,7 @@ def test_a_box_has_all_corners():
         (lambda: Polytope.of([[np.nan]], [1.0]), "NaN or inf"),
         (lambda: Polytope.of([[1.0], [-1.0]], [0.0, -1.0]), "an empty set"),
         (lambda: Polytope.of([[1.0]], [1.0]), "an unbounded set"),
+        (lambda: Polytope.of(CONE, np.ones(4)), "an unbounded set"),
         (lambda: Polytope.box([0.0], [1.0, 2.0]), "shapes (1,) and (2,)"),
         (lambda: Polytope.box([1.0], [0.0]), "expected lower <= upper"),
         (lambda: Polytope.box(np.zeros(9), np.ones(9)).vertices(), "9 dimensions"),

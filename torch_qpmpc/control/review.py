@@ -317,16 +317,16 @@ def _reach(design: Design, w: Array, known: Array) -> Array:
     of_y = bands.arguments == "y_bounds"
     zones = of_y & ~(bands.W[:, :n_y] @ np.diag(design.Q)).astype(bool)
     hard, ends = ~of_y & np.isinf(bands.price), np.empty((n_y, 2))
+    own = {"bounds": (None, None), "options": {"presolve": False}}  # presolve errs if unbounded
     for i, side in np.ndindex(n_y, 2):
         sign = 1 - 2 * side
         for kept in (hard | (zones & (bands.W[:, i] == 0)), hard):
             finite = np.isfinite(limits) & np.tile(kept, 2)
-            c, own = sign * steady.Y[i] / design.scaling.y[i], {"bounds": (None, None)}
-            least = scipy.optimize.linprog(c, rows[finite], limits[finite], method="highs", **own)
+            c = sign * steady.Y[i] / design.scaling.y[i]
+            least = scipy.optimize.linprog(c, rows[finite], limits[finite], **own)
             if least.status != 2:  # infeasible
                 break
-        otherwise = np.nan if least.status == 2 else -np.inf
-        ends[i, side] = sign * (least.fun if least.status == 0 else otherwise)
+        ends[i, side] = sign * {0: least.fun, 2: np.nan}.get(least.status, -np.inf)
     ends = ends + (steady.y @ loads / design.scaling.y)[:, None]
     return np.where(np.abs(ends) < OFFSET, 0.0, ends) * design.scaling.y[:, None]
 

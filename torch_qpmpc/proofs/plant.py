@@ -34,7 +34,7 @@ def positive(x: Array, otherwise: Any = 1.0) -> Array:
 
 def support(A: Array, b: Array, row: Array) -> float:
     """Return the support function, max row'x with A x <= b; -inf if empty, nan if undecided."""
-    result = linprog(-row, A_ub=A, b_ub=b, bounds=(None, None), method="highs")
+    result = linprog(-row, A, b, bounds=(None, None), options={"presolve": False})  # it may err
     return -result.fun if result.status == 0 else {2: -np.inf, 3: np.inf}.get(result.status, np.nan)
 
 
