@@ -92,6 +92,22 @@ def test_the_cost_is_that_of_its_formula():
     assert np.array_equal(other.known, run.known[:3]), "of a plant without known signals"
 
 
+@pytest.mark.parametrize(
+    "hard",
+    [
+        {"y_bounds": (-0.5, 0.7), "y_slack": np.inf},
+        {"constraints": {"sum": ({"u1": 0.7, "u2": 1.3}, (None, 1.0))}},
+        {"constraints": {"sum": ({"y1": 0.7, "u2": 1.3}, (None, 1.0), np.inf)}},
+    ],
+)
+def test_hard_bounds_that_rounding_violates_cost_nothing(hard):
+    """The cost of a loop at one was infinite, and so was that of each loop `learn` compares."""
+    model = [[0.9, 0.1], [0.0, 0.8]], np.diag([0.3, 0.7])
+    mpc = qm.LinearMPC(model, 6, Q=1.0, dR=0.1, R=0.01, u_bounds=(-1.0, 1.0), **hard)
+    run = qm.Controller(mpc).simulate(steps=30, r=[9.0, 9.0])
+    assert np.isfinite(run.cost).all()
+
+
 def test_violations_cost_their_price():
     run = made(y_bounds=(-0.5, 0.5), y_slack=7.0).simulate(steps=10, r=[0.0], x=[1.0])
     over = np.maximum(run.y[:-1, 0] - 0.5, 0)

@@ -71,7 +71,7 @@ def test_c_keeps_the_same_distance(model, tmp_path):
     ("share", "options", "message"),
     [
         (1.5, {}, "got 1.5 of T, expected a share in"),
-        (0.1, {"y_bounds": None}, "got 0.1 of T, expected a share in .* of a bounded output"),
+        (0.1, {"y_bounds": None}, "got 0.1 of T, expected a share in .* with y_bounds, or None"),
         (1e-4, {}, r"got 0.0001 of T, and \d+ errors .* 2 steps ahead, expected 9999 errors"),
         (0.1, {"y_bounds": (5.9, 6.0)}, "got {'T': 0.1}, which leaves no room between"),
         ({"q": 0.1}, {}, "got 'q', expected names among T"),

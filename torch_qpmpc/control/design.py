@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torch_qpmpc.checks import check_choice, check_number
 from torch_qpmpc.control.disturbance import PREFIX, TIE, Disturbances, Steady
-from torch_qpmpc.control.scaling import Scaling, but_rounding, ranges
+from torch_qpmpc.control.scaling import Scaling, but_rounding, first, inverse, ranges
 from torch_qpmpc.control.state_space import Array, StateSpace, read_vector
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.levels import DEFAULTS, hull, read_levels
@@ -192,9 +192,7 @@ class Design:
         They are half the distance of the bounds; without bounds those that cost one; and without a
         weight the outputs' sizes.
         """
-        weights = np.diag(self.Q)
-        costly = weights > 0
-        by_weight = np.where(costly, 1 / np.sqrt(np.where(costly, weights, 1.0)), self.scaling.y)
+        by_weight = first(inverse(np.sqrt(np.diag(self.Q))), self.scaling.y)
         return np.where(self.ranged, ranges(self.y_bounds), by_weight)
 
     @property
@@ -373,7 +371,8 @@ class Design:
         for name, share in self.violation.items():
             i, got = self.plant.outputs.index(name), f"{share:g} of {name}"
             if not 0 < share < 1 or not (self.zoned & (self.slack > 0))[i]:
-                raise QPError.expected("violation", got, "a share in (0, 1), of a bounded output")
+                want = "a share in (0, 1), of an output with y_bounds, or None"
+                raise QPError.expected("violation", got, want)
             k = int(self.answers(DECIDES)[i])
             e = np.zeros(0) if errors is None else np.sort(errors[:, k - 1 : k, i], axis=None)
             e = e[np.isfinite(e)]
@@ -412,7 +411,9 @@ class Design:
         above = torch.cat((y - upper, x - torch.from_numpy(own.upper)), -1)
         below = torch.cat((lower - y, torch.from_numpy(own.lower) - x), -1)
         outside, prices = above.relu() + below.relu(), np.append(self.slack, own.price)
-        prices = torch.where(outside > 0, torch.from_numpy(prices), 0.0)  # inf times 0 is none
+        sizes = np.append(self.usual, own.sizes(self.usual, self.scaling.u))
+        kept = outside <= torch.from_numpy(np.where(np.isinf(prices), TIE * sizes, 0.0))
+        prices = torch.where(kept, 0.0, torch.from_numpy(prices))  # inf times 0 is none
         return cost + (prices * outside).sum(-1)
 
     def arranged(self, arrays: Any, x: Any, target: Target, u_last: Any, known: Any) -> Any:
@@ -666,9 +667,8 @@ def read_said(name: str, value: Any, names: Sequence[str]) -> dict[str, float]:
     """Read numbers by name, but for those that None or no entry of a mapping leaves out."""
     value = {} if value is None else value
     numbers = dict(zip(names, read_vector(name, value, names, 0.0).tolist(), strict=True))
-    if isinstance(value, Mapping):
-        return {key: numbers[key] for key, x in value.items() if x is not None}
-    return numbers
+    said = value if isinstance(value, Mapping) else numbers
+    return {key: numbers[key] for key, x in said.items() if x is not None}
 
 
 def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Array]:

@@ -53,7 +53,7 @@ class Scaling(NamedTuple):
             np.zeros(k) if b is None else ranges(b) for k, b in ((n_y, y_bounds), (m, u_bounds))
         )
         weight = np.zeros(n_y) if Q is None else np.sqrt(np.diag(Q))
-        of_u = _first(_within(u, np.ones(m)), np.ones(m))
+        of_u = first(_within(u, np.ones(m)), np.ones(m))
         driven = np.hstack((plant.B * of_u, plant.E))
         x, seen, shown = np.zeros_like(driven), plant.C, np.zeros((n_y, n))
         X, Y = np.zeros_like(x), plant.C @ x
@@ -63,19 +63,19 @@ class Scaling(NamedTuple):
             shown, seen = np.maximum(shown, np.abs(seen)), seen @ A
         parts = (np.abs(plant.C) @ X).max(1, keepdims=True)  # of Y, which may cancel
         X, Y = X[:, :m] / of_u, but_rounding(Y, parts)[:, :m] / of_u
-        rest = _first(_inverse(Y.max(0)), np.ones(m))
-        aiming = _inverse((Y * _first(weight, _inverse(y))[:, None]).max(0))
-        u = _within(u, _first(aiming, rest))
-        y = _within(y, np.maximum((Y * u).max(1, initial=0.0), _inverse(weight)))
-        aimed = _first(y, (Y * u).max(1, initial=0.0), _inverse(weight))
-        aiming = _inverse((Y * _inverse(aimed)[:, None]).max(0))
-        u = _first(u, aiming, rest)
-        y = _first(y, (Y * u).max(1, initial=0.0), aimed, np.ones(n_y))
-        shows = _inverse((shown * _inverse(y)[:, None]).max(0))
+        rest = first(inverse(Y.max(0)), np.ones(m))
+        aiming = inverse((Y * first(weight, inverse(y))[:, None]).max(0))
+        u = _within(u, first(aiming, rest))
+        y = _within(y, np.maximum((Y * u).max(1, initial=0.0), inverse(weight)))
+        aimed = first(y, (Y * u).max(1, initial=0.0), inverse(weight))
+        aiming = inverse((Y * inverse(aimed)[:, None]).max(0))
+        u = first(u, aiming, rest)
+        y = first(y, (Y * u).max(1, initial=0.0), aimed, np.ones(n_y))
+        shows = inverse((shown * inverse(y)[:, None]).max(0))
         moved = but_rounding((X * u).max(1, initial=0.0), shows)
-        x = _first(np.sqrt(moved * shows), moved, shows, np.ones(n))
+        x = first(np.sqrt(moved * shows), moved, shows, np.ones(n))
         effect = (np.abs(plant.E) / x[:, None]).max(0)
-        return cls(y, u, x, _first(_inverse(effect), np.ones(len(effect))))
+        return cls(y, u, x, first(inverse(effect), np.ones(len(effect))))
 
     def plant(self, plant: StateSpace) -> StateSpace:
         """Return a plant in signals divided by their sizes."""
@@ -129,11 +129,11 @@ def _within(sizes: Array, others: Array) -> Array:
     return np.where((others > 0) & (sizes > FAR * others), 0.0, sizes)
 
 
-def _first(*sizes: Array) -> Array:
+def first(*sizes: Array) -> Array:
     """Return the first of the sizes that is not zero, for each entry."""
-    return reduce(lambda first, size: np.where(first > 0, first, size), sizes)
+    return reduce(lambda one, size: np.where(one > 0, one, size), sizes)
 
 
-def _inverse(size: Array) -> Array:
+def inverse(size: Array) -> Array:
     """Return the inverse, zero of zero."""
     return np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
