@@ -146,6 +146,17 @@ def test_a_design_with_limits_is_reviewed_and_a_default_has_room():
     assert controller.review([9.0, 0.0]).faults
 
 
+def test_a_signal_beyond_a_fixed_bound_takes_no_input_past_it():
+    """A cap of -3 took an input whose lower bound is -2 to -3, in C, too."""
+    controller, twin = exported(plant)
+    for cap in (1.0, -3.0, 1.0):
+        u = controller.step([0.0, 0.0], [1.0, 0.0], known=rows(-9.0, cap))
+        got, code = twin.step([0.0, 0.0], [1.0, 0.0], np.tile([-9.0, cap], (N + 1, 1)))
+        assert code == controller.status
+        np.testing.assert_allclose(got, u, atol=1e-9)
+        assert u[0] == -2.0 or controller.status == Outcome.SOLVED
+
+
 @refused(
     ({"u_bounds": {"u1": (0.0, "ceiling")}}, r"u_bounds: got 'ceiling'.*\['low', 'cap', 'ceil"),
     ({"y_bounds": ("low", "top")}, r"y_bounds: got 'top'.*numbers or known signals"),

@@ -192,6 +192,8 @@ def test_pairs_of_bounds_and_prices_are_of_any_numbers(read):
     ({"u_bounds": 1.0}, "u_bounds: got 1.0, expected the pair"),
     ({"du_bounds": (0.1, 0.3)}, r"du_bounds: got \(0.1, 0.3\) for u1, expected zero between"),
     ({"u_bounds": (1.0, 0.0)}, r"u_bounds: got \(1, 0\) for u1, expected lower <="),
+    ({"u_bounds": (np.inf, None)}, r"u_bounds: got \(inf, inf\) for u1, expected .* for no bound"),
+    ({"y_bounds": (None, -np.inf)}, r"y_bounds: got \(-inf, -inf\) for y1, expected .* for no "),
 )
 def test_bad_arguments_are_named(arguments):
     qm.LinearMPC(SCALAR, **{"horizon": 3, "Q": 1.0, **arguments})

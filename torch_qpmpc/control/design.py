@@ -689,9 +689,10 @@ def read_bounds(name: str, value: Any, names: Sequence[str]) -> tuple[Array, Arr
         side = [end if x is None else x for x in (side if many else [side])]
         sides.append(read_vector(f"{name}, side {i}", side if many else side[0], names, 0.0))
     lower, upper = sides
-    moves = name == "du_bounds"
-    ordered = (lower <= 0) & (upper >= 0) if moves else lower <= upper
+    some = (lower < np.inf) & (upper > -np.inf)
+    ordered, want = some & (lower <= upper), "lower <= upper in each pair, or None for no bound"
+    if name == "du_bounds":
+        ordered, want = (lower <= 0) & (upper >= 0), "zero between the bounds"
     for i in np.flatnonzero(~ordered).tolist():
-        got, want = f"({lower[i]:g}, {upper[i]:g}) for {names[i]}", "lower <= upper in each pair"
-        raise QPError.expected(name, got, "zero between the bounds" if moves else want)
+        raise QPError.expected(name, f"({lower[i]:g}, {upper[i]:g}) for {names[i]}", want)
     return lower, upper

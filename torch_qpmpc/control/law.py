@@ -189,8 +189,7 @@ class Law:
 
         The plant ``rests``, or is in a state of the log; without one it rests.
         """
-        last = np.zeros(len(self.design.plant.inputs)) if u is None else u
-        last = np.clip(last, *self.design.u_bounds)
+        last = np.clip(0.0 if u is None else u, *self.design.u_bounds)
         steps = len(self.observer.gains) - 1 if rests else 0
         runs = np.where(last > self.switches, LONG, -LONG) if self.design.levels else None
         return Memory(last, rest=(None, None if u is None else last), steps=steps, runs=runs)
@@ -429,11 +428,11 @@ class Law:
         return tries[np.nan_to_num(moves, nan=np.inf).argmin()]
 
     def _within(self, u: Array, memory: Memory, on_levels: bool = False) -> Array:
-        """Return inputs within their bounds, as known signals have them now, or on levels there."""
+        """Return inputs within their bounds, numbers before known signals, or on levels there."""
         lower, upper = self.design.u_bounds
         if memory.known is not None and self.design.limits:
             lower, upper = self.design.bounds_at(memory.known)[1]
-        u = np.minimum(np.maximum(u, lower), upper)
+        u = np.clip(np.clip(u, lower, upper), *self.design.u_bounds)
         for name, own in self.design.levels.items() if on_levels else ():
             i = self.design.plant.inputs.index(name)
             inside = np.array([x for x in own if lower[i] <= x <= upper[i]])

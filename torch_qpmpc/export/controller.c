@@ -44,14 +44,16 @@ static int are_sane(const real *x, const real most[], int rows, int columns)
     return 1;
 }
 
-/* Return x within the bounds of input i, some of which are known signals: in the last valid row. */
+/* Return x within the bounds of input i: numbers before known signals, in the last valid row. */
 static real within(const policy_state *s, real x, int i)
 {
     int seen = s->steps > UNKNOWN;
     real lower = seen && LOWER_OF[i] >= 0 ? s->known[LOWER_OF[i]] : U_LOWER[i];
     real upper = seen && UPPER_OF[i] >= 0 ? s->known[UPPER_OF[i]] : U_UPPER[i];
     if (x < lower) x = lower;
-    return x > upper ? upper : x;
+    if (x > upper) x = upper;
+    if (x < U_LOWER[i]) return U_LOWER[i];
+    return x > U_UPPER[i] ? U_UPPER[i] : x;
 }
 
 #if POLICY_LEVELS
