@@ -3,6 +3,7 @@
 import copy
 import pickle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,13 +83,19 @@ def test_a_loaded_mpc_is_the_same_and_qpmpc_reads_its_qp(tmp_path):
 def test_numbers_and_names_of_numpy_are_saved(tmp_path):
     """A file with one of them could not be read."""
     one, (q, y, cap, price) = np.float64(1.0), np.array(["q", "T", "cap", "price"])
+    numbers: Any = {
+        "horizon": np.int64(3),
+        "gamma": 0.9 * one,
+        "u_levels": {q: np.arange(3)},
+        "min_on": {q: np.int64(2)},
+        "integer_horizon": np.int64(2),
+        "max_nodes": np.int64(99),
+    }
     mpc = qm.LinearMPC(
-        ([[0.9]], [[0.1]]), np.int64(3), Q=1.0, references=np.str_("preview"), gamma=0.9 * one,
+        ([[0.9]], [[0.1]]), **numbers, Q=1.0, references=np.str_("preview"),
         inputs=[q], outputs=[y], known=[cap, price], E=[[0.0, 0.0]],
         u_bounds={q: (0 * one, cap)}, y_bounds={y: (None, one)}, y_slack={y: one},
         u_target={q: one}, linear={q: price}, constraints={y: ({q: one, y: one}, (0 * one, one))},
-        u_levels={q: np.arange(3)}, min_on={q: np.int64(2)}, start_cost={q: one},
-        integer_horizon=np.int64(2), max_nodes=np.int64(99),
     )  # fmt: skip
     for made in (mpc, qm.Controller(mpc)):
         made.save(tmp_path / "mine")
