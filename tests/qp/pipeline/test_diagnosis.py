@@ -262,6 +262,17 @@ def test_an_unstable_plant_that_is_infeasible_has_its_proof(solver):
     assert (mpc.solve(s).status == Status.INFEASIBLE).all()
 
 
+def test_multipliers_that_decay_over_a_long_horizon_are_a_proof():
+    A, B = [[1.05, 0.1, 0.0], [0.98, 1.05, 0.0], [0.0, 0.0, 1.0]], [[0.005], [0.1], [0.0]]
+    rows = [[0, 1.0, 0, 0], [1.0, 0, 0, 0], [0, 0, 1.0, 1.0]], [-0.5, -1, -14], [1.2, 0.9, 14]
+    weights = {"stage_weight": [1.0, 0.0, 0.0, 0.01], "terminal_weight": [1.0, 0.0, 0.0]}
+    options = {"constraints": rows, "constraint_slack": INF, "solver": "daqp", **weights}
+    mpc = QPMPC.from_model(A, B, 30, structure="tied", on_failure="mask", **options)
+    s = [[-0.086, 1.173, 29.602], [0.731, 0.995, 23.436], [-0.8, 0.678, -28.512]]
+    s += [[-0.284, 0.639, -29.973], [0.07, 0.551, 27.451], [0.079, -0.223, 26.718]]
+    assert (mpc.solve(doubles(s)).status == Status.INFEASIBLE).all()
+
+
 def test_noise_beside_large_numbers_spoils_no_proof(solver):
     flat = QPMPC.from_model(
         [[1.0]],

@@ -119,11 +119,11 @@ def _contradict(
     residual, reach = np.abs(qp.C.T @ chi + G_lam), _reach(qp)
     of_z = np.abs(qp.C).T @ size + np.abs(qp.G).T @ np.abs(lam)
     terms += np.minimum(np.abs(z), reach) @ of_z
-    zero = residual <= ROUNDING * of_z
+    noise = len(chi) * np.finfo(float).eps * largest * np.abs(qp.C).sum(0)  # of chi
+    zero = residual <= np.maximum(ROUNDING * of_z, np.minimum(noise, SIGNIFICANT * of_z))
     # The residual is charged at the largest |z| that the hard rows allow.
     excess = (residual * np.where(zero, 0, reach)).sum()
-    demand = qp.b @ chi + charge.sum() + excess
-    return bool(demand < -CONTRADICTED * terms)
+    return bool(qp.b @ chi + charge.sum() + excess < -CONTRADICTED * terms)
 
 
 def _without_noise(x: np.ndarray, largest: float) -> np.ndarray:
