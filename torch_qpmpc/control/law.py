@@ -217,12 +217,13 @@ class Law:
             return self._held(memory, e, Outcome.INFEASIBLE)
         p = law.design.arranged(np, e[:n], target, memory.u, known)
         plan, ahead = law._planned(p, memory, target, known, e[n:])
+        memory = memory._replace(ahead=ahead)
         if (found := plan.status[0]) and found != Status.NODE_LIMIT:
             status = Outcome.INFEASIBLE if found == Status.INFEASIBLE else Outcome.LIMIT
             return law._held(memory, e, status)
         u_s, moved = target.u[-1] if design.staged else target.u, plan.z[0, len(p) :]
         u = self._within(u_s + moved[: len(u_s)], memory, on_levels=True)
-        memory = self._after(memory, e, u, ahead)
+        memory = self._after(memory, e, u)
         return Move(u, memory, Outcome.NODE_LIMIT if found else status, law, target, p, plan)
 
     @cached_property
@@ -324,6 +325,7 @@ class Law:
     def _held(self, memory: Memory, e: Array | None, status: Outcome) -> Move:
         """Return the move of a step without a plan: the last input, within its bounds."""
         u = self._within(memory.u, memory, on_levels=True)
+        memory = memory._replace(ahead=None if self.design.levels else memory.ahead)
         return Move(u, self._after(memory, e, u), status, self)
 
     def _target(self, r: Array, known: Array, w: Array) -> Target:
@@ -357,7 +359,7 @@ class Law:
         """
         memory, e, status = self.at(memory.e, memory.u, memory.known)._seen(memory, y, known)
         u = np.where(np.abs(u) <= self.max_plausible_u, u, memory.u)
-        memory = self._after(memory, e, u, memory.ahead)
+        memory = self._after(memory, e, u)
         return memory._replace(u=self._within(u, memory)), status
 
     @property
@@ -393,9 +395,7 @@ class Law:
         memory = memory._replace(known=taken, steps=k, P=P)
         return memory, e + gain @ error, status if valid else Outcome.INVALID
 
-    def _after(
-        self, memory: Memory, e: Array | None, u: Array, ahead: Array | None = None
-    ) -> Memory:
+    def _after(self, memory: Memory, e: Array | None, u: Array) -> Memory:
         """Return the memory after a step with the input u."""
         if e is not None:
             assert memory.known is not None
@@ -403,7 +403,7 @@ class Law:
         if (runs := memory.runs) is not None:
             on = u > self.switches
             runs = np.where(on, np.maximum(runs, 0) + 1, np.minimum(runs, 0) - 1)
-        return memory._replace(u=u, e=e, runs=runs, ahead=ahead)
+        return memory._replace(u=u, e=e, runs=runs)
 
     def predicted(self, e: Array, u: Array, d: Array) -> Array:
         """Return the e after e with the input u and the known signals d."""
