@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.func import vmap
 from torch.testing import assert_close
 
 from tests.problems import KnownQP, known_qp, normal, random_mpc, random_states, solution_of
@@ -255,21 +254,6 @@ def test_an_unsolved_element_carries_infinite_cost_and_its_fixed_entries():
 
 
 # torch.func and torch.compile
-
-
-@pytest.mark.parametrize("name", OPERANDS)
-def test_vmap_over_one_operand_equals_a_loop(name):
-    known = known_qp(8, batch=(2,), soft=("inside", "above", "at_lower"), hard=())
-    operands = operands_of(known)
-    index = OPERANDS.index(name)
-    scales = torch.tensor([0.95, 1.0, 1.05]).double()
-    stack = torch.stack([scale * operands[index] for scale in scales], dim=-1)
-
-    def of_one(operand: Tensor) -> Tensor:
-        return value(*operands[:index], operand, *operands[index + 1 :])
-
-    expected = torch.stack([of_one(scale * operands[index]) for scale in scales])
-    assert_close(vmap(of_one, in_dims=-1)(stack), expected)
 
 
 def test_the_operator_keeps_torchs_contract():

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 import torch_qpmpc as qm
+from tests.figures import make_mpc
 from tests.problems import BRINK, HARD_ROWS, MIXED, SOFT_ROWS, WEAK, known_qp, normal, random_mpc
 from tests.problems import random_states as states
+from tests.transitions import transitions
 from torch_qpmpc.envs import LinearSystemEnv, PointMass
 from torch_qpmpc.qp.pipeline import solve
 from torch_qpmpc.qp.solution import QPSolution
@@ -150,11 +152,7 @@ def learned(device: torch.device) -> tuple[Tensor, list[Tensor]]:
     operator = qm.QPActorValueOperator(mpc, active_set_key="active_set")
     loss_module = qm.QPQLearningLoss(operator)
     loss_module.make_value_estimator(gamma=0.9)
-    env = LinearSystemEnv(PointMass(), num_envs=1)  # its keys, with other numbers
-    batch = env.rollout(30, break_when_any_done=False).reshape(-1)
-    batch.set("observation", states(30, size=0.5, seed=1))
-    batch.set(("next", "observation"), states(30, size=0.5, seed=2))
-    batch.set("action", states(30, 1, size=0.4, seed=3))
+    batch = transitions(30)
     with torch.no_grad():
         cost = mpc.action_value(batch["observation"].to(device), batch["action"].to(device)).cpu()
     batch.set(("next", "reward"), 0.1 * states(30, 1, seed=4) - cost.unsqueeze(-1))
@@ -179,7 +177,8 @@ def test_learning():
 
 def test_a_rollout():
     """Plant, policy and active sets are on the device, and actions are those of the policy."""
-    mpc = point_mass(1)[0].to(DEVICE)
+    mpc = make_mpc().to(DEVICE)
+    mpc.solver = "torch"
     actor = qm.QPActorValueOperator(mpc).get_policy_operator("policy_active_set")
     env = LinearSystemEnv(PointMass(), seed=0, device=DEVICE)
     with in_tensors(), torch.no_grad():
@@ -189,26 +188,9 @@ def test_a_rollout():
     assert_close(rollout["action"], expected, rtol=1e-6, atol=1e-7)
 
 
-def point_mass(count: int) -> tuple[qm.QPMPC, Tensor, Tensor]:
-    """Make a bounded QPMPC with states at the origin, within and beyond the bounds."""
-    physics = PointMass()
-    mpc = qm.QPMPC.from_model(
-        physics.A,
-        physics.B,
-        4,
-        stage_weight=[1.0] * 4 + [0.1] * 2,
-        state_bounds=([-1.0] * 4, [1.0] * 4),
-        action_bounds=([-0.5] * 2, [0.5] * 2),
-        solver="torch",
-    )
-    s = states(count, 4)
-    s[0] = 0.0
-    return mpc, s, states(count, 2, size=0.4)
-
-
 def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
     """Its method fails on half of the batch, and then on all of it."""
-    mpc, s, _ = point_mass(8)
+    mpc, s = random_mpc(solver="torch"), states(8)
     expected, whole = mpc.solve(s), interior_point.solve
     for wrong in (slice(None, None, 2), slice(None)):
 

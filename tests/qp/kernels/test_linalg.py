@@ -8,7 +8,7 @@ import pytest
 
 from tests.problems import normal
 from torch_qpmpc.qp.kernels import linalg
-from torch_qpmpc.qp.kernels.linalg import products, transposed_products
+from torch_qpmpc.qp.kernels.linalg import products
 
 RNG = np.random.default_rng(0)
 #: The spans of more than one matrix.
@@ -70,18 +70,6 @@ def test_held_arrays_are_those_of_the_caller_until_it_lets_go():
     assert sys.getrefcount(x) == free
 
 
-@pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (1, 6), (0, 3), (3, 0)])
-@pytest.mark.parametrize("M", [1, 3])
-def test_products_are_those_of_each_matrix(M, i, j):
-    matrices, group = normal(M, i, j).numpy(), np.arange(6) % M
-    left, right = normal(6, i, seed=1).numpy(), normal(6, j, seed=2).numpy()
-    expected = np.einsum("bij,bj->bi", matrices[group], right)
-    np.testing.assert_allclose(products(matrices, group, right, NONE), expected, atol=1e-12)
-    expected = np.einsum("bij,bi->bj", matrices[group], left)
-    found = transposed_products(matrices, group, left, NONE)
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
 def test_more_than_one_thread_would_take_is_multiplied_in_parts():
     matrix, vectors = normal(1, 300, 400).numpy(), normal(5, 400, seed=1).numpy()
     assert matrix.size > linalg.ONE_THREAD // 5
@@ -95,17 +83,6 @@ def test_spans_hold_all_nonzero_entries_of_any_matrix():
     matrices[1, 0, 1], matrices[1, 4, 5] = np.inf, 1.0
     expected = [[1, 3], [0, 6], [0, 0], [3, 5], [5, 6]]
     np.testing.assert_array_equal(linalg.row_spans(matrices), expected)
-
-
-@pytest.mark.parametrize("M", [1, 3])
-@pytest.mark.parametrize(("i", "j"), [(4, 7), (7, 4), (0, 3), (3, 0)])
-def test_vectors_are_multiplied_within_the_spans(i, j, M):
-    matrices, group = normal(M, i, j).numpy() * (RNG.random((M, i, j)) < 0.4), np.arange(M)
-    left, right, spans = normal(M, i).numpy(), normal(M, j).numpy(), linalg.row_spans(matrices)
-    expected = np.einsum("bij,bj->bi", matrices, right)
-    np.testing.assert_allclose(products(matrices, group, right, spans), expected, atol=1e-14)
-    found = transposed_products(matrices, group, left, spans)
-    np.testing.assert_allclose(found, np.einsum("bij,bi->bj", matrices, left), atol=1e-14)
 
 
 # For each theta

@@ -3,24 +3,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.problems import known_qp, normal, programs_of
-from torch_qpmpc.qp.pipeline.arrays import Theta, to_tensor
+from tests.problems import known_qp, normal
+from torch_qpmpc.qp.pipeline.arrays import to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
-
-
-def test_programs_of_any_batch_shapes_are_flattened_alike():
-    known = known_qp(0, batch=(3, 4), matrices=(3, 1))
-    programs, batch = Programs.of(*known.qp.tensors(), known.fixed)
-    assert batch == (3, 4)
-    assert len(programs) == 12
-    data = Theta._make(map(to_tensor, programs.theta))
-    assert data.H.shape == (3, 12, 12)  # not repeated for the four that share it
-    assert programs.group.tolist() == [0] * 4 + [1] * 4 + [2] * 4
-    assert_close(data.C[programs.group[7]], known.qp.C[1, 0])
-    assert_close(data.q[7], known.qp.q[1, 3])
-    assert_close(data.c[7], known.qp.c[1, 3])
-    assert_close(to_tensor(programs.fixed[7]), known.fixed[1, 3])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -29,31 +15,6 @@ def test_an_asymmetric_hessian_counts_by_its_symmetric_part(dtype):
     H = (known.qp.H + normal(12, 12).triu(1)).to(dtype)
     programs, _ = Programs.of(H, *known.qp.tensors()[1:], known.fixed)
     assert_close(to_tensor(programs.theta.H[0]), (H.double() + H.double().mT) / 2)
-
-
-def test_bounds_that_cross_by_rounding_alone_are_equal():
-    known = known_qp(0, dtype=torch.float32)
-    lb = torch.full_like(known.qp.lb, 0.1)
-    ub = lb.clone()
-    ub[0], ub[1] = torch.nextafter(lb[0], torch.zeros(())), 0.09
-    H, q, c, C, b, G, _, _, w = known.qp.tensors()
-    theta = Programs.of(H, q, c, C, b, G, lb, ub, w, known.fixed)[0].theta
-    assert theta.lb[0, 0] == theta.ub[0, 0] == ub[0].double()
-    assert theta.lb[0, 1] > theta.ub[0, 1]
-
-
-@pytest.mark.parametrize("matrices", [(), (6,)])
-def test_taken_programs_have_separate_matrices(matrices):
-    programs = programs_of(known_qp(0, batch=(6,), matrices=matrices))
-    index = np.array([4, 1])
-    part = programs.take(index)
-    assert len(part) == 2
-    assert len(part.theta.H) == min(len(programs.theta.H), 2)
-    for name, of in (("H", programs.group), ("q", np.arange(6)), ("c", np.arange(6))):
-        whole, own = getattr(programs.theta, name), getattr(part.theta, name)
-        own = own[part.group] if name == "H" else own
-        assert (own == whole[of][index]).all()
-    assert (part.fixed == programs.fixed[index]).all()
 
 
 def test_taken_programs_of_one_theta_share_its_preparation():

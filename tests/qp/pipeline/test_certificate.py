@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -8,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import HARD_ROWS, SOFT_ROWS, KnownQP, certified, known_qp, programs_of, times
+from tests.problems import KnownQP, certified, known_qp, programs_of, times
 from torch_qpmpc import QuadraticProgram, Status
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.refinement import refine
@@ -35,15 +34,6 @@ def judge(known: KnownQP, **claim: Tensor) -> Certificate:
     return certify(programs_of(known), parts["z"], parts["lam"], parts["chi"], parts["xi"])
 
 
-@pytest.mark.parametrize("rank", [None, 0, 3])
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_exact_solutions_are_accepted(rank, matrices):
-    known = known_qp(0, batch=(BATCH,), matrices=matrices, rank=rank)
-    certificate = judge(known)
-    assert certificate.residual.max() < 1e-12
-    assert_close(certificate.value, known.value)
-
-
 def first_row(known: KnownQP, condition: Tensor) -> int:
     """Find the first row of the spoilt element where the condition holds."""
     return int(condition[SPOILT].nonzero()[0, 0])
@@ -55,39 +45,14 @@ def shifted(tensor: Tensor, entry: int, by: float) -> Tensor:
     return out
 
 
-def without_sign(known: KnownQP) -> dict[str, Tensor]:
-    lam = known.lam.clone()
-    lam[SPOILT] *= -1
-    return {"lam": lam}
-
-
-SPOILERS: dict[str, Callable[[KnownQP], dict[str, Tensor]]] = {
-    "z moved off C z = b": lambda known: {"z": shifted(known.z, N_Z - 1, 1e-3)},
-    "fixed entry moved": lambda known: {"z": shifted(known.z, 0, 1e-3)},
-    "lam's sign flipped": without_sign,
-    "one multiplier changed": lambda known: {
-        "lam": shifted(known.lam, first_row(known, known.lam != 0), 1e-3)
-    },
-    "inside row with a multiplier": lambda known: {
-        "lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)
-    },
-    "chi wrong": lambda known: {"chi": shifted(known.chi, 1, 1e-3)},
-    "xi wrong": lambda known: {"xi": shifted(known.xi, 1, 1e-3)},
-    "NaN in z": lambda known: {"z": shifted(known.z, 3, torch.nan)},
-    "infinite multiplier": lambda known: {
-        "lam": shifted(known.lam, first_row(known, known.qp.w.isinf()), torch.inf)
-    },
-}
-
-
-@pytest.mark.parametrize("name", SPOILERS)
-def test_one_wrong_part_is_rejected_and_only_there(name):
+@pytest.mark.parametrize(("part", "entry"), [("z", N_Z - 1), ("z", 0), ("chi", 1), ("xi", 1)])
+def test_one_wrong_entry_is_rejected_and_only_there(part, entry):
+    """Of z, also a fixed one."""
     known = known_qp(1, batch=(BATCH,))
-    residual = judge(known, **SPOILERS[name](known)).residual
+    claim = {part: shifted(getattr(known, part), entry, 1e-3)}
+    residual = judge(known, **claim).residual
     assert residual[SPOILT] > 10 * TOLERANCE
-    assert not residual.isnan().any()
-    others = torch.arange(BATCH) != SPOILT
-    assert residual[others].max() < 1e-12
+    assert residual[torch.arange(BATCH) != SPOILT].max() < 1e-12
 
 
 def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Certificate:
@@ -204,20 +169,6 @@ def test_the_constant_is_part_of_the_value_but_not_of_the_tolerance():
     claim = {"lam": shifted(known.lam, first_row(known, known.lam == 0), 1e-3)}
     assert_close(judge(lifted).value, known.value + 1e9)
     assert_close(judge(lifted, **claim).residual, judge(known, **claim).residual)
-
-
-@pytest.mark.parametrize("missing", ["rows", "equalities", "fixed", "all"])
-def test_parts_of_a_program_may_be_missing(missing):
-    known = known_qp(
-        6,
-        batch=(BATCH,),
-        soft=() if missing in ("rows", "all") else SOFT_ROWS,
-        hard=() if missing in ("rows", "all") else HARD_ROWS,
-        n_c=0 if missing in ("equalities", "all") else N_C,
-        n_f=0 if missing in ("fixed", "all") else N_F,
-    )
-    assert judge(known).residual.max() < 1e-12
-    assert judge(known, z=shifted(known.z, 5, 1e-3)).residual[SPOILT] > 10 * TOLERANCE
 
 
 @pytest.mark.parametrize("matrices", [(), (BATCH,)])

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import expanded, known_qp, normal, programs_of, reduced_of, times
+from tests.problems import known_qp, normal
 from torch_qpmpc import Status, solve_qp
 from torch_qpmpc.mpc.layout import banded_matrix
-from torch_qpmpc.qp.kernels.linalg import particular
-from torch_qpmpc.qp.pipeline.arrays import SoftQPs, Theta, to_tensor
+from torch_qpmpc.qp.pipeline.arrays import Theta
 from torch_qpmpc.qp.pipeline.condensing import (
     PROXIMAL,
     SHIFT,
@@ -46,26 +45,6 @@ def theta_of(H: Tensor, C: Tensor, G: Tensor) -> Theta:
     """Make theta of these matrices, with vectors that condensing does not use."""
     none = np.zeros((1, 0))
     return Theta(H.numpy(), C.numpy(), G.numpy(), *[none] * 6)
-
-
-@pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT])
-def test_elimination_spans_the_solutions_of_the_equalities(name):
-    C = (REGULAR | DEFICIENT)[name].unsqueeze(0)
-    H, G = normal(1, 8, 8), normal(1, 4, 8)
-    n_kept = 3
-    condensed = condense(theta_of(H + H.mT, C, G), n_kept)
-    assert condensed.deficient == (name in DEFICIENT)
-    T, H_y, G_y = map(torch.from_numpy, (condensed.T, condensed.H, condensed.G))
-    assert_close(T[0, :n_kept], torch.eye(n_kept, T.shape[-1]).double())
-    n_free = 8 - n_kept - int(torch.linalg.matrix_rank(C[0, :, n_kept:]))
-    assert T.shape[-1] - n_kept == n_free
-    assert_close(C @ T[:, :, n_kept:], torch.zeros(1, C.shape[1], n_free).double())
-    # Any right-hand side that the eliminated entries can satisfy is satisfied.
-    b = C[0, :, n_kept:] @ normal(5, seed=4)
-    factors = condensed.factors, condensed.pivots, condensed.spans[4], np.zeros(1, np.int64)
-    assert_close(C[0] @ torch.from_numpy(particular(*factors, b[None].numpy(), 8)[0]), b)
-    assert_close(H_y, T.mT @ (H + H.mT) @ T)
-    assert_close(G_y, G @ T)
 
 
 @pytest.mark.parametrize("name", [*REGULAR, *DEFICIENT, "mixed"])
@@ -121,20 +100,6 @@ def test_in_the_order_of_its_rows_C_gives_the_prediction_form():
         assert_close(z[3 * k + 3 : 3 * k + 5], x, rtol=1e-11, atol=0)
 
 
-@pytest.mark.parametrize("r", [0, 3, 9])
-def test_multipliers_give_the_solution_and_its_rows(r):
-    root, G = normal(2, 5, 5), normal(2, r, 5, seed=1)
-    H = root @ root.mT
-    K, unit, inverse, rows, shift = map(torch.from_numpy, dual(H.numpy(), G.numpy()))
-    g, lam = normal(5, seed=2), normal(r, seed=3)
-    for m in range(2):
-        v = torch.linalg.solve(H[m], -g - G[m].mT @ (lam / unit[m]))
-        assert_close(-inverse[m] @ g - rows[m].mT @ lam, v)
-        assert_close((-rows[m] @ g - K[m] @ lam) * unit[m], G[m] @ v)
-        assert_close(K[m].diagonal(), torch.ones(r).double())
-    assert (shift == 0).all()
-
-
 def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
     G = np.eye(2)[None]
     H = np.diag([1e4, 0.0])[None]
@@ -142,32 +107,6 @@ def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
     searched = dual(H, G, 1e-8)  # not definite up to rounding
     assert searched.shift == pytest.approx(1e4 * SHIFT)
     assert dual(H, G, 1e-6).shift == 0
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,), (1,)])
-@pytest.mark.parametrize("batch", [(), (BATCH,)])
-def test_the_reduced_problem_is_the_problem_in_fewer_variables(batch, matrices):
-    """Its cost differs by a constant; the rows' distances to their bounds are equal."""
-    for seed in range(4):
-        known = known_qp(seed, batch=batch, matrices=matrices if batch else ())
-        p, reduced = programs_of(known), reduced_of(known)
-        data = Theta._make(map(to_tensor, p.theta))
-        qps = SoftQPs._make(map(to_tensor, p.reduced_qps()))
-        H, G = data.H[p.group], data.G[p.group]
-        v = normal(2, len(p), reduced.H.shape[-1], seed=seed)
-        z = torch.stack([expanded(p, one) for one in v])
-        assert_close(times(data.C[p.group], z), data.b.expand(2, len(p), -1))
-        cost = 0.5 * (z * times(H, z)).sum(-1) + (data.q * z).sum(-1)
-        reduced_cost = 0.5 * (v * times(qps.H[p.group], v)).sum(-1) + (qps.g * v).sum(-1)
-        assert_close(cost[0] - cost[1], reduced_cost[0] - reduced_cost[1])
-        y, Gv = times(G, z), times(qps.G[p.group], v)
-        rows, others = reduced.rows, reduced.others
-        assert sorted([*rows.tolist(), *others.tolist()]) == list(range(G.shape[-2]))
-        assert_close(y[..., rows] - data.lb[..., rows], Gv - qps.l)
-        assert_close(data.ub[..., rows] - y[..., rows], qps.u - Gv)
-        assert_close(qps.w, data.w[..., rows].expand(len(p), -1))
-        bounded = torch.isfinite(torch.maximum(data.lb, -data.ub))[..., others].any(0)
-        assert_close(y[0][..., others][:, bounded], y[1][..., others][:, bounded])
 
 
 def matrix_with(eigenvalues: list[float]) -> np.ndarray:

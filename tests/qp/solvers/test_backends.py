@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -11,14 +10,11 @@ from tests.problems import (
     one_sided,
     random_mpc,
     random_states,
-    soft_qps,
     solution_of,
 )
 from tests.references import by_cvxpy, by_quadprog
 from tests.refused import refused
 from torch_qpmpc import SolveLog, solve_qp
-from torch_qpmpc.qp.pipeline.arrays import SoftQPs
-from torch_qpmpc.qp.program import EVENT_SHAPES
 from torch_qpmpc.qp.solvers import BACKENDS, backend
 
 BATCHES = [((), ()), ((1,), ()), ((6,), ()), ((6,), (6,)), ((3, 4), (3, 1)), ((3, 4), (4,))]
@@ -93,16 +89,6 @@ def test_costs_without_curvature(solver, rank):
     assert_solves(known_qp(3, batch=(6,), rank=rank), solver, only_value=True)
 
 
-def test_a_batch_is_solved_as_each_of_its_elements(solver):
-    known = known_qp(4, batch=(5,), matrices=(5,))
-    together = solve_qp(known.qp, known.fixed, solver=solver)
-    for i in range(5):
-        parts = {name: getattr(known.qp, name)[i] for name in EVENT_SHAPES}
-        alone = solve_qp(replace(known.qp, **parts), known.fixed[i], solver=solver)
-        assert_close(alone.value, together.value[i], rtol=1e-7, atol=1e-8)
-        assert_close(alone.z, together.z[i], rtol=1e-5, atol=1e-6)
-
-
 def test_the_answer_does_not_depend_on_what_was_solved_before(solver):
     known, other = known_qp(5, batch=(3,)), known_qp(6, batch=(3,))
     first = solve_qp(known.qp, known.fixed, solver=solver)
@@ -144,19 +130,6 @@ def test_two_other_solvers_of_the_printed_program_agree(solver, mpc_case):
             assert_close(solution.z[i].detach(), z, rtol=1e-4, atol=1e-4)
 
 
-def test_the_programs_compared_have_rows_of_every_kind(mpc_case):
-    qp, fixed, _ = mpc_case
-    solution = solve_qp(qp, fixed, solver="daqp")
-    active = (solution.upsilon + solution.eta) > 1e-6
-    softened = solution.sigma > 1e-6
-    hard = qp.w.isinf()
-    assert (active & hard).any()
-    assert (active & ~hard & ~softened).any()
-    assert softened.any()
-    assert (~active & hard).any()
-    assert (~active & ~hard).any()
-
-
 # Warm starts
 
 
@@ -169,16 +142,6 @@ def test_a_warm_start_from_the_solution_saves_iterations(name):
 
 
 # The table of backends
-
-
-def test_a_backend_answers_with_one_row_per_program(solver):
-    known = known_qp(14, batch=(4,))
-    qps, _ = soft_qps(known)
-    found = backend(solver)(SoftQPs._make(x.numpy() for x in qps))
-    assert found.v.shape == qps.g.shape
-    assert found.lam.shape == qps.l.shape
-    assert found.iterations.shape == (4,)
-    assert found.v.dtype == found.lam.dtype == np.float64
 
 
 @refused(
