@@ -121,15 +121,6 @@ def test_loops_of_a_nonlinear_policy_have_their_gradient_and_improve():
     assert report.after < 0.9 * report.before
 
 
-def test_the_policy_sees_the_state_of_the_identified_model(found):
-    plain = dataclasses.replace(found, model=found.fit.model)
-    assert len(plain.model.A) < len(found.model.A)
-    for one in (found, plain):
-        plant = simulated_plant(one, lambda p, u: p.sum(-1), 5, members=2)
-        seen = plant.known(plant.starts(torch.Generator().manual_seed(0), 4))
-        assert seen.shape == (4, len(one.model.A))
-
-
 def test_an_identified_plant_has_the_moments_of_its_model(found):
     """The first outputs and the later innovations have the model's covariances."""
     model, n = found.model, len(found.model.A)
@@ -397,39 +388,29 @@ def test_noise_that_grows_with_the_action_is_identified(seed):
     np.testing.assert_array_equal(c[1:], np.eye(1, 4).repeat(2, 0))
 
 
-def test_simulated_noise_grows_as_the_logs():
-    rng, logs = np.random.default_rng(0), []
-    for _ in range(20):
-        x, u = [rng.normal(size=1)], rng.uniform(-1, 1, (60, 1))
-        for k in range(60):
-            x.append(
-                0.8 * x[-1] + u[k] * (1 + 1.2 * rng.normal(size=1)) + 0.02 * rng.normal(size=1)
-            )
-        logs.append({"y": np.array(x), "u": u})
-    plant = simulated_plant(identify(logs, order=0), lambda p, u: p.sum(-1), 5, members=1)
-    draw = torch.Generator().manual_seed(0)
-    s = plant.starts(draw, 4000)
-    for level in (0.0, 0.5, 1.0):
-        u = torch.full((4000, 1), level).double()
-        after = plant.known(plant.step(s, u, plant.draw(draw, 4000)))
-        e = after - 0.8 * plant.known(s) - u
-        assert e.std().item() == pytest.approx(np.hypot(1.2 * level, 0.02), rel=0.15, abs=0.1)
-
-
-def test_where_noise_grows_the_sensors_part_neither_grows_nor_moves_the_state():
+@pytest.mark.parametrize("sensor", [0.0, 0.2])
+def test_simulated_noise_grows_as_the_logs(sensor):
+    """The sensor's part neither grows nor moves the state."""
     rng, logs = np.random.default_rng(0), []
     for _ in range(40):
         x, u = [rng.normal(size=1)], rng.uniform(-1, 1, (60, 1))
         for k in range(60):
             x.append(0.8 * x[-1] + u[k] * (1 + rng.normal(size=1)) + 0.02 * rng.normal(size=1))
-        logs.append({"y": np.array(x) + 0.2 * rng.normal(size=(61, 1)), "u": u})
-    plant = simulated_plant(identify(logs, order=1), lambda p, u: p.sum(-1), 5, members=1)
-    assert plant._growth[0, 0, 2] == 0  # of the slow disturbance, whose size in a log is its own
+        logs.append({"y": np.array(x) + sensor * rng.normal(size=(61, 1)), "u": u})
+    found = identify(logs, order=int(sensor > 0))
+    plant = simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
     draw = torch.Generator().manual_seed(0)
-    s = plant.starts(draw, 2000)
-    for level, std in ((1.0, 1.0 / 0.6), (0.0, 0.02 / 0.6)):
+    s = plant.starts(draw, 4000)
+    for level, std in ((1.0, 1.0 / 0.6), (0.5, 0.5 / 0.6), (0.0, 0.02 / 0.6)):
+        u = torch.full((4000, 1), level).double()
         for _ in range(40):
-            s = plant.step(s, torch.full((2000, 1), level).double(), plant.draw(draw, 2000))
+            before, s = plant.known(s)[:, 0], plant.step(s, u, plant.draw(draw, 4000))
         assert s[:, 0].std().item() == pytest.approx(std, rel=0.4, abs=0.2)
-    own, _, y, *_ = plant._parts(s)
-    assert (y - plant._own.at("C", own)).std().item() == pytest.approx(0.2, rel=0.3)
+        assert plant.known(s)[:, 0].mean().item() == pytest.approx(s[:, 0].mean().item(), abs=0.1)
+        if not sensor:
+            e = plant.known(s)[:, 0] - 0.8 * before - level
+            assert e.std().item() == pytest.approx(np.hypot(level, 0.02), rel=0.15, abs=0.1)
+    if sensor:
+        assert plant._growth[0, 0, 2] == 0  # of the slow disturbance, of one size in a log
+        own, _, y, *_ = plant._parts(s)
+        assert (y - plant._own.at("C", own)).std().item() == pytest.approx(sensor, rel=0.3)

@@ -198,13 +198,12 @@ def test_comparisons_have_seeds_of_their_own():
 def test_the_comparisons_of_a_run_share_one_alpha():
     gate, shares = Gate(Policy(2.0), costs, decisions=3), []
     for _ in range(4):
-        shares.append(gate._test().alpha)  # of the next comparison
-        gate.judge(Policy(2.5))
+        shares.append(gate.judge(Policy(2.5)).alpha)
     assert shares == [pytest.approx(0.05 * 3 / (k * (k + 1))) for k in (3, 4, 5, 6)]
     assert sum(3 / (k * (k + 1)) for k in range(3, 100_000)) == pytest.approx(1, abs=1e-4)
     resumed = Gate(Policy(2.0), costs, decisions=3)
     resumed.load_state_dict(gate.state_dict())
-    assert resumed._test().alpha == gate._test().alpha
+    assert resumed.judge(Policy(2.5)).alpha == gate.judge(Policy(2.5)).alpha
 
 
 def test_the_state_is_restored():
@@ -219,11 +218,9 @@ def test_the_state_is_restored():
 @refused(
     (lambda: PairedTest(0.0), "alpha"),
     (lambda: PairedTest(bound=-1.0), r"bound: got -1.0, expected a finite number > 0"),
-    (lambda: Gate(Policy(1.0), costs, bound=0.0), "bound"),
     (lambda: Gate(Policy(1.0), costs, decisions=0), "decisions"),
     (lambda: PairedTest().add(torch.zeros(2, 2)), "differences"),
     (lambda: Gate(Policy(1.0), costs, pairs=8), "pairs"),
-    (lambda: Gate(Policy(1.0), costs, alpha=1.0), "alpha"),
     (lambda: Gate(Policy(1.0), costs, patience=0), "patience"),
     (lambda: Gate(Policy(1.0), costs, seed=-1), "seed"),
     (lambda: Gate(Policy(1.0), lambda *_: torch.zeros(())).judge(Policy(1.0)), "costs"),

@@ -238,24 +238,6 @@ def test_numbers_out_of_range_are_named(options, of_step):
     GaussNewton(mpc := random_mpc(2), **options).step(*pairs(), targets(mpc), **of_step)
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
-def test_a_batch_without_a_usable_pair_moves_nothing(bad):
-    mpc = random_mpc(15, on_failure="mask")
-    optimizer = GaussNewton(mpc)
-    before, (s, a) = copy.deepcopy(mpc.state_dict()), pairs()
-    a[1] = 9.0  # beyond a hard bound
-    penalty = SystemIdentificationPenalty(1e-2).curvature(normal(5, mpc.n_z))
-    message = "None of the 7 pairs is usable: 1 without a QP .*, 6 without a finite target. Theta"
-    with pytest.warns(RuntimeWarning, match=message):
-        report = optimizer.step(s, a, torch.full((COUNT,), bad), penalty=penalty)
-    assert not report.accepted
-    assert math.isnan(report.ratio)
-    assert not report.usable.any()
-    assert report.damping == optimizer.param_groups[0]["damping"] == 0.03
-    assert_close(mpc.state_dict(), before, rtol=0, atol=0)
-    assert not optimizer.state
-
-
 def test_the_trust_region_counts_weighted_errors():
     """The predicted decrease is that of the weighted objective: a small step meets it."""
     mpc = random_mpc(2)

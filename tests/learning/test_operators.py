@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.store import Store, collect
+from tests.store import collect
 from tests.store import make_mpc as make_store_mpc
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, SolveLog, SolverError
 from torch_qpmpc.envs import PointMass
@@ -87,15 +87,6 @@ def test_a_preview_is_an_input_of_its_own():
         operator(td.exclude("preview", ("next", "preview")))
     with pytest.raises(QPError, match=r"s: got shape \(3, 4, 2\), expected shape \(\*batch, 10\)"):
         whole(td)
-
-
-def test_a_policy_of_p_for_closed_loops():
-    plant, mpc = Store(), make_store_mpc()
-    cold = closed_loop(mpc.policy, plant, steps=8, starts=4)
-    warm = closed_loop(warm_policy(mpc), plant, steps=8, starts=4)
-    torch.testing.assert_close(warm.actions, cold.actions, rtol=0, atol=1e-7)
-    idle = closed_loop(lambda p: 0 * p[:, :1], plant, steps=8, starts=4)
-    assert cold.J < idle.J
 
 
 def evaluate(operator: QPActorValueOperator, td: TensorDict) -> list[torch.Tensor]:

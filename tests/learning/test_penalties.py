@@ -10,8 +10,6 @@ from torch.testing import assert_close
 
 from tests.problems import drawn_mpc
 from torch_qpmpc import QPMPC, DeviationPenalty, QPError, SystemIdentificationPenalty
-from torch_qpmpc.envs import PointMass
-from torch_qpmpc.mpc.layout import banded_matrix
 
 N_X, N_U, N = 2, 1, 4
 N_Z = N * (N_X + N_U) + N_X
@@ -95,25 +93,6 @@ def test_system_identification_penalty_window_by_window(generator):
     assert SystemIdentificationPenalty()(C, windows, 0 * b) == SystemIdentificationPenalty()(
         C, windows
     )
-
-
-def test_true_model_explains_noise_free_windows(generator):
-    physics, horizon = PointMass(noise_std=0.0), 5
-    s, entries = 0.5 * normal(generator, 6, 4), []
-    for _ in range(horizon):
-        a = (0.5 * normal(generator, 6, 2)).clamp(-1, 1)
-        entries += [s, a]
-        s = physics.step(s, a, torch.zeros(4))
-    windows = torch.cat([*entries, s], dim=-1)
-    penalty = SystemIdentificationPenalty(1.0)
-    assert penalty(banded_matrix(physics.A, physics.B, horizon), windows).item() < 1e-25
-    A, B, _ = physics.corrupted(1)
-    assert penalty(banded_matrix(A, B, horizon), windows).item() > 1e-2
-    # Its gradient at the corrupted model points towards the true one.
-    C = banded_matrix(A, B, horizon).requires_grad_()
-    (gradient,) = torch.autograd.grad(penalty(C, windows), C)
-    towards = banded_matrix(physics.A, physics.B, horizon) - C
-    assert (gradient * towards).sum() < 0
 
 
 def test_the_si_penalty_as_a_quadratic_in_C():

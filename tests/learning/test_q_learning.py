@@ -9,7 +9,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from tests import store
 from tests.transitions import (
     GAMMA,
     LEARN,
@@ -23,7 +22,7 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPMPC, GaussNewton, QPActorValueOperator, QPError
+from torch_qpmpc import QPMPC
 from torch_qpmpc.learning.td_error import inverse_variance
 
 
@@ -61,35 +60,6 @@ def test_loss_and_its_gradients(estimator, delay_value):
         if isinstance(online, torch.nn.Parameter):
             assert torch.equal(frozen, online) != delay_value
             assert (frozen.data_ptr() == online.data_ptr()) != delay_value
-
-
-@pytest.mark.parametrize("delay_value", [False, True])
-def test_loss_and_its_gradients_with_a_preview(delay_value):
-    operator = store.make_operator()
-    twin = copy.deepcopy(operator.module)
-    loss = make_loss(operator=operator, delay_value=delay_value)
-    if delay_value:
-        SoftUpdate(loss, tau=0.1)
-    td = store.collect(3, 8).reshape(-1)
-    assert {"preview", ("next", "preview")} <= set(loss.in_keys)
-    loss(td)["loss_value"].backward()
-
-    def known(data: TensorDictBase) -> Tensor:
-        return torch.cat((data["preview"], data["observation"]), -1)
-
-    with torch.no_grad():
-        V = twin.value(known(td["next"]))
-    target = -td["next", "reward"].squeeze(-1) + GAMMA * V
-    Q = twin.action_value(known(td), td["action"])
-    (0.5 * (target - Q).square().mean()).backward()
-    for (name, part), expected in zip(
-        operator.module.named_parameters(), twin.parameters(), strict=True
-    ):
-        assert expected.grad is not None
-        assert expected.grad.norm() > 0 or ".ub." in name, name  # no state is at its upper bound
-        torch.testing.assert_close(part.grad, expected.grad, msg=name)
-    with pytest.raises(QPError, match=r"^preview: got .*, expected one with preview"):
-        loss(td.exclude(("next", "preview")))
 
 
 def test_priority_weights():
@@ -308,26 +278,3 @@ def test_c_stays_without_a_usable_transition_or_a_discount():
     loss.make_value_estimator()
     td["next", "reward"] = torch.full((7, 9, 1), torch.nan)
     assert loss.centre_(td) == 0.0
-
-
-def test_a_transition_out_of_the_data_does_not_raise_its_own_target_for_ever():
-    """Q of s = 1 learns from V of s+ = 2, which is four times as large."""
-    scheme = {"stage_weight": torch.eye(2), "hessian": "block", "gamma": GAMMA, "solver": "daqp"}
-    costs = []
-    for observed in (False, True):
-        mpc = QPMPC.from_model([[0.0]], [[1.0]], 1, learn=("H", "c"), **scheme)
-        operator = QPActorValueOperator(mpc)
-        loss, optimizer = make_loss(operator=operator), GaussNewton(mpc)
-        td = make_batch(1)
-        td["observation"] = torch.ones(1, 1).double()
-        td["action"] = torch.zeros(1, 1).double()
-        td["next", "observation"] = 2 * torch.ones(1, 1).double()
-        td["next", "reward"] = -torch.ones(1, 1).double()
-        td["next", "terminated"] = torch.zeros(1, 1).bool()
-        if observed:
-            loss.observe(td)
-        for _ in range(60):
-            optimizer.step(td["observation"], td["action"], -loss.target(td))
-        costs.append(mpc.action_value(td["observation"], td["action"]).item())
-    assert costs[0] > 1e6
-    assert 0 < costs[1] <= 1 / (1 - GAMMA)

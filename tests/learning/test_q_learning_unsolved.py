@@ -54,18 +54,6 @@ def test_unsolved_samples_are_masked(where, bad):
     torch.testing.assert_close(mean(td)["loss_value"], expected["loss_value"] / 6)
 
 
-def test_a_batch_without_any_solved_sample():
-    operator, td = hard_operator(), feasible_batch(3)
-    td["observation"] += 5.0
-    message = "None of the 3 pairs is usable: 3 without a QP solution, 0 without a finite target"
-    with pytest.warns(RuntimeWarning, match=message):
-        out, total = gradients(make_loss(operator=operator), td)
-    assert out["unsolved"].item() == 3
-    assert out["invalid_reward"].item() == 0
-    assert all(out[key].item() == 0 for key in ("loss_value", *METADATA))
-    assert all(torch.equal(g, torch.zeros_like(g)) for g in total)
-
-
 @pytest.mark.parametrize("estimator", TRACE)
 def test_an_unsolved_value_after_termination_is_not_needed(estimator):
     """The target is -L alone, so the sample counts for any state after the end."""

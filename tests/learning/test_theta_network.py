@@ -129,32 +129,18 @@ def test_finite_differences_through_theta_keys(output):
 
 
 @pytest.mark.parametrize("known", [{}, {"n_d": 1}], ids=["state", "preview"])
-@pytest.mark.parametrize("delay_value", [False, True])
-def test_q_learning_trains_the_network_and_the_qp(delay_value, known):
-    mpc, theta, operator = scheduled(known, moved=False)
-    loss = QPQLearningLoss(critic_of(theta, operator), delay_value=delay_value)
+def test_the_loss_is_that_of_the_residuals_by_hand(known):
+    mpc, theta, operator = scheduled(known)
+    loss = QPQLearningLoss(critic_of(theta, operator))
     loss.make_value_estimator(gamma=0.9)
     assert ("theta", "q") not in loss.in_keys
     td = transitions(mpc)
     before = set(td.keys(True, True))
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
-    parts = [theta.net[-1].weight, *mpc.leaves("C")]
-    start = [x.detach().clone() for x in parts]
-    loss(td)["loss_value"].backward()
-    optimizer.step()
-    assert all((x != y).any() for x, y in zip(parts, start, strict=True))
-    assert set(td.keys(True, True)) - before == {"td_error"}  # theta is not stored
-
-
-def test_the_loss_is_that_of_the_residuals_by_hand():
-    mpc, theta, operator = scheduled()
-    loss = QPQLearningLoss(critic_of(theta, operator))
-    loss.make_value_estimator(gamma=0.9)
-    td = transitions(mpc)
     value = TensorDictSequential(theta, operator.get_value_operator())(td["next"].clone())
     target = td["next", "reward"] + 0.9 * value["state_value"]
     prediction = critic_of(theta, operator)(td.clone())["state_action_value"]
     assert_close(loss(td)["loss_value"], 0.5 * (target - prediction).square().mean())
+    assert set(td.keys(True, True)) - before == {"td_error"}  # theta is not stored
 
 
 @pytest.mark.parametrize("part", ["net.4.weight", "module.C"])

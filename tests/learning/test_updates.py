@@ -4,7 +4,6 @@ from typing import Any
 import cvxpy as cp
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.optim.lr_scheduler import LambdaLR
 from torch.testing import assert_close
 
@@ -239,27 +238,6 @@ def test_the_deviation_penalty_needs_the_rate_of_a_free_C():
     penalties = Penalties(DeviationPenalty(fixed))
     with pytest.raises(QPError, match="optimizer: got one that does not move C, expected"):
         second_order(fixed, make_loss(fixed), GaussNewton(fixed), penalties)
-
-
-def test_the_second_order_finds_the_gain_of_the_riccati_equation():
-    """On a scalar system with noise, from a wrong terminal cost."""
-    A, B, R, gamma, P, K = 0.9, 0.5, 0.5, 0.95, 0.0, 0.0
-    for _ in range(1000):
-        K = gamma * A * B * P / (R + gamma * B * B * P)
-        P = 1 + R * K * K + gamma * P * (A - B * K) ** 2
-    cost = {"stage_weight": [2.0, 2 * R], "terminal_weight": [0.1], "learn": ("H", "H_f", "c")}
-    mpc = QPMPC.from_model([[A]], [[B]], 2, gamma=gamma, solver="daqp", **cost)
-    loss = QPQLearningLoss(QPActorValueOperator(mpc))
-    loss.make_value_estimator(gamma=gamma)
-    update = second_order(mpc, loss, GaussNewton(mpc), Penalties())
-    x, noise = torch.linspace(-2, 2, 5).double(), torch.tensor([-0.3, 0.3]).double()
-    s, a, w = (part.reshape(-1, 1) for part in torch.meshgrid(x, x, noise, indexing="ij"))
-    done = torch.zeros(len(s), 1, dtype=torch.bool)
-    following = {"observation": A * s + B * a + w, "reward": -(s.square() + R * a.square())}
-    following |= {"done": done, "terminated": done}
-    for _ in range(10):
-        update(TensorDict(observation=s, action=a, next=following, batch_size=len(s)), None)
-    assert -mpc.policy(torch.ones(1, 1).double()).item() == pytest.approx(K, rel=1e-3)
 
 
 def test_the_second_order_keeps_active_sets():
