@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.runs import SMALL, choices, linear_system, make_config
+from tests.runs import SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator, SolveLog
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment.algorithms import (
@@ -72,16 +72,6 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         factor = 1 - 0.8 * min(update, 8) / 8
         for group in optimizer.param_groups:
             assert group["lr"] == pytest.approx(rates[group["name"]] * factor)
-
-
-def test_evaluation_is_without_exploration_and_repeatable():
-    cfg = make_config(*SMALL, "task.eval_steps=12")
-    physics = linear_system(cfg)
-    mpc = make_mpc(cfg, physics)
-    first, second = evaluate(cfg, mpc.policy, physics), evaluate(cfg, mpc.policy, physics)
-    assert first.states.shape == (13, 32, 4)
-    assert torch.equal(first.states, second.states)
-    torch.testing.assert_close(first.actions[0], mpc.policy(first.states[0]).detach())
 
 
 @pytest.mark.parametrize("task", ["point_mass", "gros_zanon", "pendulum"])

@@ -195,17 +195,6 @@ def test_a_log_without_rewards_needs_a_weight():
 # Runs
 
 
-def test_a_run_from_data_starts_well(tmp_path):
-    """The point mass with its own cost starts near the MPC with the true model."""
-    settings = ("updates=2", "start.transitions=2000", "constraint=fixed", "task.eval_steps=50")
-    summary = train.train(make_config(*DATA, *settings, "seed=5"), str(tmp_path))
-    wrong = train.train(
-        make_config(*SMALL, "updates=2", "constraint=fixed", "task.eval_steps=50", "seed=5"),
-        str(tmp_path / "wrong"),
-    )
-    assert summary["J_start"] < 0.5 * (wrong["J_start"] + summary["J_true_model"])
-
-
 def test_the_log_is_kept_read_and_shown(tmp_path, capsys):
     cfg = make_config(*DATA)
     train.train(cfg, str(tmp_path / "first"))

@@ -190,19 +190,6 @@ def test_a_scheme_passes_what_is_known_and_more(store_task):
                 make_mpc(cfg, plant)
 
 
-def test_train_learns_a_plants_qp(store_task, tmp_path):
-    """With both penalties, a step of second order, and figures; every step is in the replay."""
-    options = ("optimizer=gauss_newton", "constraint=combined", "figures=true")
-    cfg = make_config("task=store", *SMALL, *options)
-    summary = train.train(cfg, str(tmp_path), quiet=True)
-    assert summary["unsolved"] == 0
-    assert math.isfinite(summary["J_final"])
-    assert summary["J_final"] != summary["J_start"]
-    assert summary["J_start"] == summary["J_true_model"]
-    for figure in ("summary.png", "episode.png"):
-        assert (tmp_path / figure).exists()
-
-
 # A user's task
 
 

@@ -6,11 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box
 from hydra import compose, initialize_config_dir
 
 import train
@@ -137,44 +135,6 @@ def test_a_stream_whose_transitions_are_used_once_learns(tmp_path):
     assert (hard == [-1.0, 1.0]).all(axis=None)
 
 
-class Greenhouse(gymnasium.Env):
-    """Air is heated and vented; the cost is of the soil, which is slow and not seen."""
-
-    observation_space = Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = Box(0.0, 1.0, (2,), np.float64)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.air, self.soil = self.np_random.uniform((13.0, 10.0), (17.0, 14.0))
-        self.damp, self.k = 0.6, 0
-        return np.array([self.air, self.damp]), {}
-
-    def step(self, action):
-        (heat, vent), outside = action, 5 + 5 * np.sin(self.k / 15)
-        self.k, before = self.k + 1, self.air
-        loss = 0.5 * (0.3 + vent) * (self.air - outside) + 0.5 * (self.air - self.soil)
-        self.air += 0.1 * (8 * heat - loss)
-        self.soil += 0.01 * (before - self.soil)
-        self.damp += 0.1 * (0.3 - (0.2 + vent) * self.damp)
-        cost = 0.1 * (self.soil - 18) ** 2 + heat
-        y = np.array([self.air + 0.1 * self.np_random.standard_normal(), self.damp])
-        return y, -float(cost), False, False, {}
-
-
-@pytest.mark.filterwarnings("ignore:.*stage cost explains")
-def test_a_slow_plant_with_a_hidden_state_takes_few_qps_an_update(tmp_path, register):
-    id = register(Greenhouse, 200)
-    plant = ("task=gymnasium", f"task.id={id}", "start=data", "task.start_episodes=0")
-    plain = ("rivals=false", "figures=false", "gate=false", "task.eval_steps=5")
-    cfg = make_config(*plant, *plain, "updates=6", "eval_interval=6")
-    summary, table = train.train(cfg, str(tmp_path), quiet=True), metrics(tmp_path)
-    assert summary["order"] > 2
-    assert summary["unsolved"] == 0
-    collected = cfg.num_envs * cfg.steps_per_update
-    assert table["qp/solves"].max() <= 3 * cfg.batch_size + collected  # V(s+), Q before and after
-    assert table["qp/iterations"].max() < 20
-
-
 def test_what_the_end_cannot_show_is_said(tmp_path, monkeypatch, capsys):
     """A rival or a figure that fails costs no run."""
 
@@ -208,20 +168,6 @@ def test_uneven_intervals_and_steps(tmp_path):
     assert list(metrics(tmp_path)["eval/J"].dropna().index) == [0, 3, 5]
     assert list(metrics(tmp_path)["loss/value"].dropna().index) == [2, 4]
     assert load_file(tmp_path / "checkpoint.pt", KIND)["update"] == 5
-
-
-def test_training_continues_past_unsolved_qps(tmp_path):
-    """Hard state bounds are infeasible at high velocities."""
-    more = ("task.state_slack=inf", "noise.std=0.5", "constraint=free")
-    summary = run_small(
-        tmp_path, *more, "task.episode_steps=5", "eval_interval=9", "task.eval_steps=2"
-    )
-    table = metrics(tmp_path).drop(index=0)
-    assert summary["unsolved"] == table["qp/unsolved"].sum() > 0
-    assert table["train/unsolved"].sum() > 0
-    assert np.isfinite(table["loss/value"]).all()
-    state = load_file(tmp_path / "checkpoint.pt", KIND)["mpc"]
-    assert all(value.isfinite().all() for value in state.values())
 
 
 def test_a_bad_configuration_writes_nothing(tmp_path):
