@@ -6,14 +6,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.envs import TransformedEnv
+from torch.testing import assert_close
 
 from tests.envs.test_gymnasium_plant import Counter
 from tests.envs.test_kalman_filter import model
 from tests.store import Store
-from torch_qpmpc.envs import GymnasiumPlant, KalmanFilter, PlantEnv, PointMass
+from torch_qpmpc.envs import GymnasiumPlant, PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.errors import QPError
 
@@ -51,50 +50,8 @@ def test_closed_loop_follows_the_protocol(kind, std):
     assert pytest.approx(discounted) == run.discounted(0.9)
 
 
-class Recorded(Store):
-    """A store with given signals and starts."""
-
-    given: tuple[Tensor, Tensor]
-
-    def __init__(self, w: Tensor, x: Tensor, **options: Any) -> None:
-        super().__init__(**options)
-        object.__setattr__(self, "given", (w, x))
-
-    def signals(self, rng, count, length):
-        w, _ = self.given
-        assert w.shape == (count, length, 4)
-        return w
-
-    def starts(self, rng, count):
-        return self.given[1]
-
-
-def test_a_loop_is_an_episode_of_the_environment():
-    """Both show a policy the same p, and have the same costs."""
-
-    def policy(p: Tensor) -> Tensor:
-        return (0.5 + p[:, :1] - p[:, 2:3] + p[:, -1:] - p[:, -2:-1] - p[:, -3:-2]).sigmoid()
-
-    plant, steps = Store(horizon=2, observer=model(3, 2, 2)), 6
-    observer = KalmanFilter(model(3, 2, 2))
-    env: Any = TransformedEnv(PlantEnv(plant, 4, steps, torch.float64, seed=0), observer)
-    actor: Any = TensorDictModule(
-        lambda *known: policy(torch.cat(known, -1)), ["preview", "observation"], ["action"]
-    )
-    data = env.rollout(steps, actor)
-    w = env.base_env._signals[data["episode"][:, 0, 0]]
-    recorded = Recorded(w, data["state"][:, 0], horizon=2, observer=plant.observer)
-    run = closed_loop(policy, recorded, steps=steps, starts=4)
-    seen = torch.cat((data["preview"], data["observation"]), -1)
-    assert torch.equal(run.known[:-1], seen.transpose(0, 1))
-    last = data["next"][:, -1]
-    assert torch.equal(run.known[-1], torch.cat((last["preview"], last["observation"]), -1))
-    assert torch.equal(run.states, run.known[..., -3:])
-    assert torch.equal(run.actions, data["action"].transpose(0, 1))
-    assert torch.equal(run.costs, -data["next", "reward"].squeeze(-1).T)
-
-
-def test_the_seed_determines_signals_and_starts_of_a_plant():
+@pytest.mark.parametrize("observer", [None, model(3, 2, 2)], ids=["outputs", "estimates"])
+def test_the_seed_determines_signals_and_starts_of_a_plant(observer):
     class Rival:
         begun: Any = None
 
@@ -102,10 +59,10 @@ def test_the_seed_determines_signals_and_starts_of_a_plant():
             self.begun = (plant, x, w)
 
         def __call__(self, p: Tensor) -> Tensor:
-            assert p.shape == (3, 8 + 2)
+            assert p.shape == (3, 8 + (3 if observer else 2))
             return torch.full((3, 1), 2.0).double()
 
-    plant, rival = Store(), Rival()
+    plant, rival = Store(observer=observer), Rival()
     run = closed_loop(rival, plant, steps=5, starts=3, seed=7)
     rng = np.random.default_rng(7)
     w = plant.signals(rng, 3, 5 + 3 + 1)
@@ -115,10 +72,17 @@ def test_the_seed_determines_signals_and_starts_of_a_plant():
     assert torch.equal(rival.begun[2], w)
     one = torch.ones(3, 1).double()
     assert torch.equal(run.actions, one.expand(5, 3, 1)), "as applied: clipped"
+    y = []
     for k in range(5):
-        assert torch.equal(run.states[k], plant.output(x, w[:, k]))
+        y.append(plant.output(x, w[:, k]))
+        assert torch.equal(run.known[k, :, :8], w[:, k : k + 4, :2].flatten(1))
         assert torch.equal(run.costs[k], plant.cost(x, one, w[:, k]))
         x = plant.step(x, one, w[:, k])
+    y = torch.stack((*y, plant.output(x, w[:, 5])))
+    for i in range(3):
+        u, d = run.actions[:, i].numpy(), w[i, :5, :2].numpy()
+        seen = observer.estimates(y[:, i].numpy(), u, d) if observer else y[:, i]
+        assert_close(run.states[:, i], torch.as_tensor(seen), rtol=1e-9, atol=1e-9)
 
 
 def test_policy_gets_float64_and_leaves_no_graph():
