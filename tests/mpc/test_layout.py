@@ -19,13 +19,6 @@ from torch_qpmpc.mpc.layout import band_distance, banded_matrix
 # Sizes
 
 
-def test_sizes_are_whole_numbers_of_any_kind():
-    sizes: Any = (np.int64(2), 1, np.int32(3))
-    layout = Layout(*sizes)
-    assert layout == Layout(2, 1, 3)
-    assert type(layout.n_x) is int
-
-
 @refused(
     ({"n_x": 0}, "n_x: got 0, expected a whole number >= 1"),
     ({"horizon": "3"}, "horizon: got '3', expected a whole number >= 1"),

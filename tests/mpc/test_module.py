@@ -6,7 +6,6 @@ import itertools
 import pickle
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacfwd, jacrev
 from torch.testing import assert_close
 
 from tests.mpc.settings import (
@@ -56,7 +54,6 @@ from tests.problems import (
 from tests.refused import refused
 from torch_qpmpc import QPMPC, GaussNewton, QPError, QuadraticProgram, SolverError, Status, solve_qp
 from torch_qpmpc.mpc.riccati import riccati_weight
-from torch_qpmpc.qp.solution import QPSolution
 
 # V, Q and the policy
 
@@ -158,54 +155,6 @@ def test_gradients_in_theta_and_p_agree_with_differences(name, function):
         assert_close(
             found.double(), difference, rtol=1e-4, atol=atol, msg=lambda m, x=leaf_name: f"{x} {m}"
         )
-
-
-#: Schemes with a state at which rows meet without a multiplier, or many rows have one.
-STRUCTURED: dict[str, tuple[dict[str, Any], list[float]]] = {
-    "set-point": ({"terminal_constraints": ([[1, 0], [0, 1]], [0, 0], [0, 0])}, [0, 0]),
-    "opposite": ({"terminal_constraints": ([[1, 0], [-2, 0]], [-9, -9], [0, 0])}, [0, 0]),
-    "no power": (
-        {"constraints": ([[0, 0, 1, 1], [0, 0, 3, 0], [0, 0, 0, 1]], [-9, 0, 0], [0, 9, 9])},
-        [0, 0],
-    ),
-    "pinned": ({"action_bounds": ([-9, 0], [9, 0])}, [0, 0]),
-    "pinned, away": ({"action_bounds": ([-9, 0], [9, 0])}, [0.5, -0.3]),
-    "saturated": ({"action_bounds": ([-0.2, -0.1], [0.2, 0.1])}, [4, -1]),
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "solver"),
-    [*zip(STRUCTURED, itertools.cycle(("proxqp", "daqp", "torch")), strict=False)],
-)
-def test_derivatives_where_a_controller_spends_its_life(name, solver):
-    options, s = STRUCTURED[name]
-    mpc = QPMPC.from_model(
-        A,
-        torch.cat((B, torch.tensor([[0.1], [0.2]]).double()), 1),
-        4,
-        stage_weight=torch.diag(torch.tensor([1.0, 0.2, 0.1, 0.3])) + 0.01,
-        constraint_slack=torch.inf,
-        **options,
-    )
-    program, towards = mpc.quadratic_program(), random_states(*mpc.C.shape)
-
-    def solution(p: Tensor) -> QPSolution:
-        C = program.C.detach() + p[2] * towards
-        return solve_qp(replace(program, C=C, check_values=False), p[:2], solver=solver)
-
-    def policy(p: Tensor) -> Tensor:
-        return solution(p).z[2:4]
-
-    def slope(p: Tensor) -> Tensor:
-        return jacrev(lambda p: solution(p).value)(p)
-
-    at = torch.tensor([*s, 0.0]).double()
-    for f in (policy, slope):
-        steps = 1e-4 * torch.eye(3).double()
-        differences = torch.stack([(f(at + d) - f(at - d)) / 2e-4 for d in steps], -1)
-        for derivative in (jacrev(f)(at), jacfwd(f)(at)):
-            assert_close(derivative, differences, rtol=1e-4, atol=1e-4)
 
 
 # Shapes and dtypes
