@@ -108,19 +108,6 @@ def test_stacked_modules_are_those_of_an_ensemble():
             assert_close(parameters[name].grad[k], part.grad)
 
 
-def test_modules_of_different_classes_are_stacked_by_tensordict():
-    mpcs, s = [random_mpc(seed) for seed in range(3)], random_states(4)
-    with pytest.raises(RuntimeError, match="all models to be of the same class"):
-        stack_module_state(mpcs)
-    stacked = TensorDict.from_modules(*mpcs, as_module=True)
-
-    def of_one(parameters: TensorDict, s: Tensor) -> Tensor:
-        with parameters.to_module(mpcs[0]):
-            return mpcs[0].value(s)
-
-    assert_close(vmap(of_one, (0, None))(stacked, s), torch.stack([m.value(s) for m in mpcs]))
-
-
 # Forward mode
 
 
