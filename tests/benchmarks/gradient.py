@@ -33,12 +33,12 @@ REFERENCE = next(iter(PEERS))
 #: Our rounds by batch, and the number of them between two of the reference; others' rounds.
 ROUNDS, PEERS_ROUNDS = {1: (60, 15), 256: (60, 15), 1024: (9, 9)}, {1: 5, 256: 1, 1024: 1}
 #: The largest batch of peers for which larger ones take minutes.
-PATIENCE = {"qpth": 256, "cvxpylayers": 256, "Moreau": 256}
+PATIENCE = {"qpth": 256, "cvxpylayers": 256}
 #: Relative change of theta since the solutions that warm starts use.
 MOVED = 1e-3
 #: Packages that are timed, or that times depend on.
 PACKAGES = ("torch", "numpy", "proxsuite", "daqp", "qpth", "cvxpylayers", "diffcp", "clarabel")
-PACKAGES += ("qpsolvers", "moreau")
+PACKAGES += ("qpsolvers",)
 
 
 class Gradient(NamedTuple):

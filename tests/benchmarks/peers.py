@@ -108,7 +108,7 @@ def clarabel() -> Values:
     return values
 
 
-def moreau(device: str = "cpu", solver: str = "active_set") -> Values:
+def moreau(device: str, solver: str) -> Values:
     """Make Moreau's torch layer, at its default tolerances, for each size of a batch."""
     package, Solver = import_module("moreau"), import_module("moreau.torch").Solver
     layers: dict[torch.Size, Any] = {}
@@ -138,7 +138,6 @@ PEERS: dict[str, Callable[[], Values]] = {
     "qpth": qpth,
     "cvxpylayers": cvxpylayers,
     "Clarabel through qpsolvers": clarabel,
-    "Moreau": moreau,
 }
 
 
