@@ -84,7 +84,7 @@ SHORT = {
     "python train.py task=gros_zanon solver=daqp": Short(FEW, quick=True),
     "python train.py task=pendulum gate=plant": Short(FEW, quick=True),
     "python train.py task.file=docs/examples/house.py": Short(FEW),
-    PENDULUM: Short(DATA, quick=True),
+    PENDULUM: Short(DATA),
     f"{PENDULUM} hydra.run.dir=runs/mine": Short(DATA),
     "python train.py task=gymnasium task.id=InvertedPendulum-v5 start=data": Short(
         DATA, needs=("mujoco",)
