@@ -26,7 +26,7 @@ def test_candidates_are_judged(run):
     folder, summary = run
     assert summary["accepted"] + summary["rejected"] == 3
     assert summary["accepted"] > 0
-    table = read_metrics(folder)
+    table: Any = read_metrics(folder)
     assert table["qp/solves"].max() <= 3 * 32 + 4 * 4  # V(s+), Q before and after, and collected
     judged = table.dropna(subset=["gate/pairs"])
     assert judged.index.to_list() == [3, 6, 8]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -37,7 +38,7 @@ def test_a_run_with_far_too_large_a_rate_ends_with_a_summary(tmp_path, optimizer
     state = load_file(tmp_path / "checkpoint.pt", KIND)["mpc"]
     assert not any(value.isnan().any() for value in state.values())
     assert state["C"].isfinite().all()
-    table = pd.read_csv(tmp_path / "metrics.csv")
+    table: Any = pd.read_csv(tmp_path / "metrics.csv")
     assert len(table) == 6, "each update has reported"
     assert summary["unsolved"] == table["qp/unsolved"].sum()
     if slack == "inf":

@@ -177,7 +177,7 @@ def test_gradients_of_all_parts_do_not_depend_on_the_units(cost, length):
         multipliers = found.lam * row, found.chi * equality, found.xi * z[:2]
         parts = found.z / z, *(x / cost for x in multipliers)
         weighted = [(normal(*x.shape, seed=i) * x).sum() for i, x in enumerate(parts)]
-        gradients = torch.autograd.grad(sum(weighted), leaves, materialize_grads=True)
+        gradients = torch.autograd.grad(torch.stack(weighted).sum(), leaves, materialize_grads=True)
         return [torch.where(x.isfinite(), x, 0) for x in gradients]
 
     ordinary = in_units(1.0, 1.0, 1.0, 1.0)
