@@ -1,8 +1,12 @@
 """Disturbances that an observer can estimate, and messages about those that it cannot."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import torch_qpmpc as qm
 from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.control.disturbance import Steady, choose
@@ -39,6 +43,56 @@ def test_random_plants_with_integrators_get_detectable_disturbances_one_for_each
         w = choose(plant)
         assert len(w.names) == n_y
         assert full_rank(plant, w)
+
+
+def of_a_lag(
+    load: np.ndarray, act: Callable[[float], float], noise: float
+) -> dict[str, np.ndarray]:
+    """Return the log of a lag of gain one with a load at its input."""
+    rng, x, y, u = np.random.default_rng(0), 0.0, [], []
+    for w in load:
+        y.append(x + noise * rng.normal())
+        u.append(act(y[-1]))
+        x = 0.8 * x + 0.2 * (u[-1] + w)
+    return {"y": np.array(y), "u": np.array(u)}
+
+
+@pytest.mark.parametrize("pole", [0.98, 1.0])
+def test_after_a_log_that_drifts_a_load_leaves_no_tail(pole, tmp_path):
+    """The target did not know of the drift: a fifth of a load stayed for hundreds of steps."""
+    rng, load = np.random.default_rng(1), np.zeros(1000)
+    for k in range(999):
+        load[k + 1] = pole * load[k] + 0.01 * rng.normal()
+    model = qm.identify(of_a_lag(load, lambda _: rng.uniform(-1, 1), 0.01))
+    mpc = qm.LinearMPC(model, 20, Q={"y": 1.0}, R={"u": 0.3}, u_bounds=(-2, 2))
+    controller = qm.Controller(mpc)
+    assert controller._law.drift == pytest.approx(0.01, rel=0.25)
+    controller.save(tmp_path / "c.qpmpc")
+    for own in (controller, qm.Controller.load(tmp_path / "c.qpmpc")):
+        own.redesign(Q={"y": 2.0})
+        run = of_a_lag(np.full(50, 0.5), lambda y, own=own: own.step([y], [0.0])[0], 0.0)
+        assert np.abs(run["y"][-10:]).max() < 1e-4
+        assert run["u"][-1] == pytest.approx(-0.5, abs=1e-4)
+
+
+def test_drifts_of_a_log_come_first_in_the_units_of_their_outputs():
+    plant, shown = read_model((np.diag([0.8, 0.5, 0.2]), np.eye(3))), np.zeros((6, 2))
+    shown[1, 0], shown[0, 1] = -0.05, 0.02  # half of state 2's distance from rest, and state 1's
+    w = choose(replace(plant, drifts=shown))
+    assert w.names == tuple(f"disturbance of y{i}" for i in (1, 2, 3))
+    np.testing.assert_allclose(w.changes, [0.02 / 0.21, 0.05 / 0.51, 0])
+    np.testing.assert_allclose(w.B, np.diag([0.21, 0.51, 0.0]), atol=1e-15)
+    np.testing.assert_allclose(w.C, np.diag([0.0, 0.0, 1.0]))
+    assert choose(replace(plant, drifts=shown), {"y1": "output"}).changes == 0
+
+
+def test_a_drift_that_is_an_integrating_input_s_takes_its_place():
+    plant = read_model(INTEGRATOR)
+    w = choose(replace(plant, drifts=np.array([[0.0], [0.01], [0.0]])))
+    assert w.names == ("disturbance of y1",)
+    assert full_rank(plant, w)
+    hidden = choose(replace(plant, drifts=np.array([[0.0], [0.0], [0.01]])))
+    assert hidden.names == ("disturbance of u1",), "an output's cannot be told from the mode"
 
 
 @refused(

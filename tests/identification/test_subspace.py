@@ -100,7 +100,10 @@ def test_the_steady_gain_is_the_plants_where_the_level_drifts(pole, walk, seed):
     log = loaded(seed, pole, walk)
     read = qm.read_log(log, outputs=["y1", "y2"], inputs=["u1", "u2"])
     found = qm.identify(read)
-    np.testing.assert_allclose(gain(found.fit.model), [[1, 0.5], [0, 1]], atol=0.1)
+    plant, C_w = found.fit.plant
+    for model in (found.fit.model, plant):
+        np.testing.assert_allclose(gain(model), [[1, 0.5], [0, 1]], atol=0.1)
+    assert plant.E.shape[1] == C_w.shape[1] == found.fit.drifts
     assert f"of which no input moves {found.fit.drifts}" in str(found)
 
 
@@ -140,8 +143,8 @@ def test_a_dead_time_beyond_the_orders_is_told_with_the_order_that_finds_it():
 
 def cycle() -> dict[str, np.ndarray]:
     """Return the log of a display of tenths behind two lags, whose input has a period."""
-    u, x = np.sign(np.sin((np.arange(300) + 0.5) * np.pi / 10)), np.zeros((300, 2))
-    for k in range(299):
+    u, x = np.sign(np.sin((np.arange(340) + 0.5) * np.pi / 10)), np.zeros((340, 2))
+    for k in range(339):
         x[k + 1] = 0.9 * x[k, 0] + 0.1 * u[k], 0.3 * x[k, 0] + 0.7 * x[k, 1]
     return {"y": np.round(x[:, 1], 1), "u": u}
 

@@ -45,9 +45,10 @@ class Controller:
         noise: standard deviations of the outputs' noise, as a number, a vector or by name; by
             default the identification's, else a tenth of half the distance between the output's
             bounds or, without bounds, of ``1 / sqrt(Q)``.
-        drift: standard deviations of each disturbance's change in a step; by default it moves an
-            output by its identified noise within the horizon, else as ``noise``. A larger ratio of
-            drift to noise rejects disturbances faster and passes on more noise.
+        drift: standard deviations of each disturbance's change in a step; by default those that
+            the log shows, else it moves an output by its identified noise within the horizon, else
+            as ``noise``. A larger ratio of drift to noise rejects disturbances faster and passes on
+            more noise.
         gain: L ``(n + n_w, n_y)`` of an observer of your own, see `Observer`, or a function of F
             and H that returns it. Another model, noise or drift brings the Kalman filter back.
 

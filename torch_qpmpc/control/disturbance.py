@@ -21,10 +21,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from torch_qpmpc.control.scaling import Scaling, but_rounding
 from torch_qpmpc.control.state_space import Array, StateSpace
@@ -46,11 +48,15 @@ OUTPUT, PREFIX = "output", "disturbance of "
 
 
 class Disturbances(NamedTuple):
-    """B_w ``(n, n_w)`` and C_w ``(n_y, n_w)``, and a name for each entry of w."""
+    """B_w ``(n, n_w)`` and C_w ``(n_y, n_w)``, and a name for each entry of w.
+
+    ``changes`` are the standard deviations of w+ - w that a log shows, zero where it shows none.
+    """
 
     B: Array
     C: Array
     names: tuple[str, ...]
+    changes: Array | float = 0.0
 
 
 def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = None) -> Disturbances:
@@ -59,9 +65,9 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
     Args:
         plant: the model.
         scaling: the sizes of its signals, by default of a plant without bounds.
-        wanted: ``"auto"``: one at an input for each integrating mode, and at the outputs for the
-            others. A mapping from outputs to ``"output"`` or the name of an input;
-            outputs that are left out have none. None: no disturbances.
+        wanted: ``"auto"``: those that the log shows, one at an input for each integrating mode, and
+            at the outputs for the others. A mapping from outputs to ``"output"`` or the name of an
+            input; outputs that are left out have none. None: no disturbances.
 
     Raises:
         QPError: a name is unknown, or the disturbances or the model are not detectable.
@@ -71,33 +77,53 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
         return Disturbances(np.zeros((n, 0)), np.zeros((n_y, 0)), ())
     normal = (scaling or Scaling.of(plant)).plant(plant)
     check_observable(normal)
+    kinds: Mapping[str, Any] = wanted if isinstance(wanted, Mapping) else {}
     if isinstance(wanted, str) and wanted == "auto":
-        wanted = _automatic(normal, INTEGRATES)
-        if _hidden(normal, _placed(normal, wanted)) is not None:
-            wanted = _automatic(normal, RANK)
+        logged = normal.drifts
+        for drifts, near in product((logged, logged[:, :0]), (INTEGRATES, RANK)):
+            kinds = _automatic(normal, near, drifts)
+            if _hidden(normal, _placed(normal, kinds)) is None:
+                break
     elif not isinstance(wanted, Mapping):
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
-    if (hidden := _hidden(normal, _placed(normal, wanted))) is not None:
-        got = f"{dict(wanted)}, whose {hidden} cannot be told from a mode at 1"
+    if (hidden := _hidden(normal, _placed(normal, kinds))) is not None:
+        got = f"{dict(kinds)}, whose {hidden} cannot be told from a mode at 1"
         remedy = "At an integrating mode take a disturbance of its input, and at others one of the "
         remedy += "output; 'auto' chooses so. There can be no more disturbances than outputs."
         raise QPError.expected("disturbances", got, "detectable disturbances", remedy)
-    return _placed(plant, wanted)
+    return _placed(plant, kinds)
 
 
-def _placed(plant: StateSpace, wanted: Mapping[str, str]) -> Disturbances:
-    """Return the disturbances of a mapping from outputs to "output" or inputs."""
-    n, _, n_y, _ = plant.sizes
-    B, C, names = [], [], []
-    for output, kind in wanted.items():
-        if output not in plant.outputs or kind not in (OUTPUT, *plant.inputs):
+def _placed(plant: StateSpace, kinds: Mapping[str, Any]) -> Disturbances:
+    """Return the disturbances of a mapping from outputs to "output", an input or a drift's number.
+
+    A drift has the unit of its output, which it moves by one in the end.
+    """
+    (n, _, n_y, _), n_w = plant.sizes, plant.drifts.shape[1]
+    columns, names, changes = [], [], []
+    for output, kind in kinds.items():
+        if output not in plant.outputs or kind not in (OUTPUT, *plant.inputs, *range(n_w)):
             want = f"an output among {plant.outputs}, 'output' or an input among {plant.inputs}"
             raise QPError.expected("disturbances", f"{output!r}: {kind!r}", want)
-        at_output = kind == OUTPUT
-        B.append(np.zeros(n) if at_output else plant.B[:, plant.inputs.index(kind)])
-        C.append(np.eye(n_y)[plant.outputs.index(output)] if at_output else np.zeros(n_y))
-        names.append(f"{PREFIX}{output if at_output else kind}")
-    return Disturbances(np.array(B).reshape(-1, n).T, np.array(C).reshape(-1, n_y).T, (*names,))
+        row, name, change = plant.outputs.index(output), output, 0.0
+        if kind == OUTPUT:
+            column = np.eye(n + n_y)[n + row]
+        elif kind in plant.inputs:
+            column, name = np.pad(plant.B[:, plant.inputs.index(kind)], (0, n_y)), kind
+        else:
+            size = _effect(plant, plant.drifts)[row, kind] or 1.0
+            column, change = plant.drifts[:, kind] / size, abs(size)
+        columns.append(column)
+        names.append(f"{PREFIX}{name}")
+        changes.append(change)
+    B, C = np.split(np.array(columns).reshape(-1, n + n_y).T, [n])
+    return Disturbances(B, C, (*names,), np.array(changes))
+
+
+def _effect(plant: StateSpace, drifts: Array) -> Array:
+    """Return what drifts move outputs by in the end, or nearly so, ``(n_y, n_w)``."""
+    B, C = np.split(drifts, [len(plant.A)])
+    return plant.C @ np.linalg.solve((1 + INTEGRATES) * np.eye(len(B)) - plant.A, B) + C
 
 
 def check_observable(plant: StateSpace) -> None:
@@ -130,17 +156,20 @@ def null_direction(balance: Array, *shown: Array) -> Array | None:
     return None if full else V[-1].conj() / columns
 
 
-def _automatic(plant: StateSpace, tolerance: float) -> dict[str, str]:
-    """Choose inputs for the modes at one, and outputs for the rest, one for each output."""
-    n, _, n_y, _ = plant.sizes
+def _automatic(plant: StateSpace, tolerance: float, drifts: Array) -> dict[str, Any]:
+    """Choose drifts, inputs for the modes at one, and outputs for the rest, one for each output."""
+    (n, _, n_y, _), n_w = plant.sizes, drifts.shape[1]
     U, sizes, _ = np.linalg.svd(plant.A - np.eye(n))
     modes = U[:, sizes <= tolerance * max(sizes[0], 1.0)].T  # of A', near one
-    taken = _independent(modes @ plant.B)[:n_y]
-    shown = np.pad(plant.C, ((0, 0), (0, len(taken))))
-    columns = np.block([[plant.A - np.eye(n), plant.B[:, taken]], [shown]])
+    taken = _independent(modes @ plant.B)[: n_y - n_w]
+    moved = np.pad(plant.B[:, taken], ((0, n_y), (0, 0)))
+    columns = np.hstack((np.vstack((plant.A - np.eye(n), plant.C)), moved, drifts))
     # Output disturbances fill what the other columns leave.
     rest = scipy.linalg.null_space(columns.T, rcond=RANK)[n:].T
-    kinds = {plant.outputs[i]: OUTPUT for i in _independent(rest)[: n_y - len(taken)]}
+    kinds = {plant.outputs[i]: OUTPUT for i in _independent(rest)[: n_y - len(taken) - n_w]}
+    free = [i for i, name in enumerate(plant.outputs) if name not in kinds]
+    pairs = scipy.optimize.linear_sum_assignment(-np.abs(_effect(plant, drifts)[free]))
+    kinds |= {plant.outputs[free[i]]: int(k) for i, k in zip(*pairs, strict=True)}
     others = (name for name in plant.outputs if name not in kinds)
     kinds |= zip(others, (plant.inputs[i] for i in taken), strict=False)
     return {name: kinds[name] for name in plant.outputs if name in kinds}

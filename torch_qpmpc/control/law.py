@@ -149,6 +149,7 @@ class Law:
         if design.plant.noise is not None:
             share = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual))) / design.usual
             drifts = moving(design, share * design.usual)
+            drifts = np.where(np.greater(w.changes, 0), w.changes, drifts)
         else:
             drifts = np.full(len(w.names), SMALL) * design.of_w(design.usual)
         noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)

@@ -217,7 +217,8 @@ def _identified(log: Log, plant: StateSpace) -> Identified:
         if acts and column.std() <= STILL * column.abs().max():
             remedy = "Its effect cannot be learned: pass rows in which it varies."
             raise QPError.expected("known", f"a constant {name}", "one that varies", remedy)
-    return identify(log, 1 if plant.errors is None else plant.errors.shape[1], order=len(plant.A))
+    order = len(plant.A) + plant.drifts.shape[1]
+    return identify(log, 1 if plant.errors is None else plant.errors.shape[1], order=order)
 
 
 def _with_model(law: Law, model: Identified) -> Law:

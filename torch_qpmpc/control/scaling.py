@@ -94,7 +94,9 @@ class Scaling(NamedTuple):
             visited = visited[0] / x, visited[1] / x / x[:, None]
         names = plant.inputs, plant.outputs, plant.known
         A, B, C, E, offset = map(but_rounding, matrices)
-        return StateSpace(A, B, C, E, offset, None, *names, noise=noise, visited=visited)
+        drifts = plant.drifts / np.concatenate((x, y))[:, None]
+        log = {"noise": noise, "visited": visited, "drifts": drifts}
+        return StateSpace(A, B, C, E, offset, None, *names, **log)
 
     def at_rest(
         self, plant: StateSpace, u: Array, d: Array, y: Array | None = None, weight: float = 1.0

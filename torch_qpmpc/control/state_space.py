@@ -38,6 +38,8 @@ class StateSpace:
         visited: mean ``(n,)`` and covariance ``(n, n)`` of the states in its log.
         means: the means of its inputs and known signals, by name.
         errors: its errors of held-out predictions 1, .., N steps ahead, ``(rows, N, n_y)``.
+        drifts: [B_w; C_w] ``(n + n_y, n_w)`` of the disturbances that its log shows; they change by
+            one in the root mean square of the steps.
         dynamics: the function x+ = f(x, u) or f(x, u, d) of a nonlinear model, which is linearised
             at the ``point`` [d; x; u]; None of a linear one.
 
@@ -59,6 +61,7 @@ class StateSpace:
     visited: tuple[Array, Array] | None = None
     means: Mapping[str, float] = field(default_factory=dict)
     errors: Array | None = None
+    drifts: Any = None
     dynamics: Any = None
     point: Any = None
 
@@ -69,6 +72,8 @@ class StateSpace:
             if (got := getattr(self, name[0]).shape) != shape:
                 remedy = "Each column of B and E, and each row of C_y, has one name."
                 raise QPError.expected(name, f"shape {got}", f"{shape}", remedy)
+        if self.drifts is None:
+            object.__setattr__(self, "drifts", np.zeros((n + n_y, 0)))
         names = (*self.inputs, *self.outputs, *self.known)
         if wrong := [x for x in names if not isinstance(x, str) or names.count(x) > 1]:
             remedy = "Inputs, outputs and known signals are addressed by name."
@@ -155,7 +160,8 @@ def read_model(
         if model.identified is None:
             raise QPError.expected("model", "a file's", "what qm.identify_nonlinear returns")
         _check_absent("the log has its own", known=known or None)
-        plant = read_model(model.identified, E, dt, inputs, outputs)
+        linear = replace(model.identified, fit=model.identified.fit._replace(plant=None))
+        plant = read_model(linear, E, dt, inputs, outputs)
         return replace(plant, dynamics=model, errors=None).at(model.middle.numpy())
     if isinstance(model, Sequence) and len(model) in (3, 4) and callable(model[0]):
         _check_absent("the function has known signals as its d", E=E)
@@ -164,11 +170,14 @@ def read_model(
         own = np.zeros((len(x),) * 2), np.zeros((len(x), len(u))), *(C or [np.eye(len(x))])
         plant = read_model(own, None, None, inputs, outputs, known)
         return replace(plant, dynamics=f, dt=dt).at(np.concatenate((np.zeros(len(known)), x, u)))
-    offset, units, noise, states, means, errors = None, {}, None, None, {}, None
+    offset, units, noise, states, means, errors, drifts = None, {}, None, None, {}, None, None
     if isinstance(model, Identified):
         _check_absent("the identification has its own", E=E)
-        A, B, E, offset, C, L, S, *_ = model.fit.model  # a controller has its own disturbances
-        noise, states = (L, S), visited(model.fit.model, model.log.trajectories)
+        own, C_w = model.fit.plant or (model.fit.model, np.zeros((len(model.log.outputs), 0)))
+        E, B_w = np.split(own.E, [len(model.log.known)], 1)
+        A, B, _, offset, C, L, S, *_ = own  # a controller has its own disturbances
+        noise, states = (L, S), visited(own._replace(E=E), model.log.trajectories)
+        drifts = np.vstack((B_w, C_w))
         errors = model.errors.numpy()[:: len(model.errors) // MOST_ERRORS + 1].copy()
         log, dt = model.log, _own_dt(dt, model.log.dt)
         units, signals = dict(log.units), (*log.inputs, *log.known)
@@ -205,7 +214,7 @@ def read_model(
     outputs = outputs or [f"y{i + 1}" for i in range(len(C))]
     offset = np.zeros(len(A)) if offset is None else offset
     names = tuple(inputs), tuple(outputs), tuple(known)
-    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states, means, errors)
+    return StateSpace(A, B, C, E, offset, dt, *names, units, noise, states, means, errors, drifts)
 
 
 def _check_absent(why: str, **arguments: Any) -> None:

@@ -91,6 +91,9 @@ class Fit(NamedTuple):
         candidates: those that were compared.
         parts: models that have not seen the outputs of a part of the log each.
         drifts: the number of modes that no input moves.
+        plant: the model without these, whose E has the columns of known signals and of the drifts
+            w, and C_w ``(n_y, n_w)``, so that y = C x + C_w w; w changes by one in the root mean
+            square of the steps. None without drifts, or with outputs that no input moves.
     """
 
     model: Innovations
@@ -99,6 +102,7 @@ class Fit(NamedTuple):
     candidates: tuple[Candidate, ...] = ()
     parts: tuple[Innovations, ...] = ()
     drifts: int = 0
+    plant: tuple[Innovations, Array] | None = None
 
 
 def fit_state_space(
@@ -138,8 +142,25 @@ def fit_state_space(
         if count and far(drifting) <= far(par) + WORSE:
             par, drifts = drifting, count
         model = readable(steady(par), data)
+    plant = None
+    if order and 0 < drifts < order and not normal.apart.any():
+        own, C_w = _without_drifts(par, drifts, data)
+        plant = normal.restore(own), normal.y_size[:, None] * C_w
     model, *parts = map(normal.restore, (model, *parts))
-    return Fit(model, order or 0, lags, tuple(rows), tuple(parts), drifts)
+    return Fit(model, order or 0, lags, tuple(rows), tuple(parts), drifts, plant)
+
+
+def _without_drifts(par: Noisy, drifts: int, data: Sequence[Signals]) -> tuple[Innovations, Array]:
+    """Return `Fit.plant` of a model whose last states are drifts, their means as offsets."""
+    A, B, C, Q, R, m0, P0 = par
+    n, model = len(A) - drifts, steady(par)
+    level = np.concatenate(each(model, data, model.estimates))[:, n:].mean(0)
+    shift = np.linalg.pinv(C[:, :n]) @ C[:, n:] @ level
+    B = B[:n].copy()
+    B[:, -1] += A[:n, n:] @ level + shift - A[:n, :n] @ shift
+    own = Noisy(A[:n, :n], B, C[:, :n], Q[:n, :n], R, m0[:n] + shift, P0[:n, :n])
+    change = np.linalg.cholesky(Q[n:, n:])
+    return readable(steady(own), data, A[:n, n:] @ change), C[:, n:] @ change
 
 
 def held_out_errors(
@@ -191,7 +212,8 @@ def _correlations(
     for lag in range(1, last + 1):
         after = np.concatenate([rows[lag:] for rows in data])
         before = np.concatenate([rows[: max(len(rows) - lag, 0)] for rows in data])
-        size = np.sqrt((after**2).T @ before**2)
+        squares = (after**2).T @ before**2  # past and future ones are as sure: no end decides
+        size = np.sqrt(np.maximum(squares, squares.T))
         z.append(after.T @ before / np.where(size > 0, size, 1.0))
     return np.array(z)
 
@@ -433,12 +455,12 @@ class _Normal:
         one, S = np.eye(count), self.changes.T @ self.changes / len(self.changes)
         A = joined(model.A, one)
         A[:n, n:] = model.B[:, self.n_u + n_d :]
-        B = np.pad(model.B, ((0, count), (0, 0)))[states]
+        B, E = (np.pad(x, ((0, count), (0, 0)))[states] for x in (model.B, model.E))
         spread = np.cov(self.first.T, bias=True).reshape(count, count) - S
         return Innovations(
             A[np.ix_(states, states)],
             B[:, : self.n_u],
-            B[:, self.n_u : self.n_u + n_d],
+            np.hstack((B[:, self.n_u : self.n_u + n_d], E)),
             np.pad(model.offset, (0, count))[states],
             np.eye(n_y, n + count),
             joined(model.L, one)[np.ix_(states, outputs)],
@@ -571,8 +593,8 @@ def _states(predictor: tuple[list[Array], list[Signals], Array], order: int) -> 
     return Noisy(AB[:, :order], AB[:, order:], C, Q, R, np.linalg.pinv(C) @ first, np.eye(order))
 
 
-def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
-    """Return the model with the outputs as the first states, and others of unit variance."""
+def readable(model: Innovations, data: Sequence[Signals], E: Array | None = None) -> Innovations:
+    """Return the model, with E, of the outputs as first states, and others of unit variance."""
     n, C = len(model.A), model.C
     cov = np.cov(np.concatenate(each(model, data, model.estimates)).T, bias=True).reshape(n, n)
     root = np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(n))
@@ -580,5 +602,6 @@ def readable(model: Innovations, data: Sequence[Signals]) -> Innovations:
     hidden = np.linalg.solve(root.T, Vh[int((s > HIDDEN * s[0]).sum()) :].T).T
     hidden *= np.sign(hidden[np.arange(len(hidden)), np.abs(hidden).argmax(1)])[:, None]
     T = np.concatenate((C, hidden))
+    model = model if E is None else model._replace(E=E)
     model = model.transformed(T, np.linalg.pinv(T), np.zeros(len(T)))
     return model._replace(C=np.eye(len(C), len(T)))
