@@ -49,15 +49,15 @@ def read_tensors(path: Path) -> Any:
 def save_file(path: str | Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write ``content``, tensors and plain values by name, as a file of a ``kind``."""
     buffer = io.BytesIO()
-    torch.save({"kind": kind, "version": VERSION, **plain(content)}, buffer)
+    torch.save({"kind": kind, "version": VERSION, **plain(dict(content))}, buffer)
     write_whole(Path(path), buffer.getbuffer())
 
 
 def plain(value: Any) -> Any:
     """Return ``value`` with Python's numbers and strings in place of NumPy's, which are code."""
-    if isinstance(value, Mapping):
+    if type(value) is dict:  # a TensorDict is a Mapping, too
         return {plain(name): plain(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
+    if type(value) in (list, tuple):
         return type(value)(map(plain, value))
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else value
 

@@ -25,8 +25,7 @@ from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
+import scipy  # imports its parts at their first use
 
 from torch_qpmpc.control.scaling import Scaling, but_rounding
 from torch_qpmpc.control.state_space import Array, StateSpace
@@ -167,9 +166,10 @@ def _automatic(plant: StateSpace, tolerance: float, drifts: Array) -> dict[str, 
     # Output disturbances fill what the other columns leave.
     rest = scipy.linalg.null_space(columns.T, rcond=RANK)[n:].T
     kinds = {plant.outputs[i]: OUTPUT for i in _independent(rest)[: n_y - len(taken) - n_w]}
-    free = [i for i, name in enumerate(plant.outputs) if name not in kinds]
-    pairs = scipy.optimize.linear_sum_assignment(-np.abs(_effect(plant, drifts)[free]))
-    kinds |= {plant.outputs[free[i]]: int(k) for i, k in zip(*pairs, strict=True)}
+    if n_w:
+        free = [i for i, name in enumerate(plant.outputs) if name not in kinds]
+        pairs = scipy.optimize.linear_sum_assignment(-np.abs(_effect(plant, drifts)[free]))
+        kinds |= {plant.outputs[free[i]]: int(k) for i, k in zip(*pairs, strict=True)}
     others = (name for name in plant.outputs if name not in kinds)
     kinds |= zip(others, (plant.inputs[i] for i in taken), strict=False)
     return {name: kinds[name] for name in plant.outputs if name in kinds}
