@@ -9,7 +9,7 @@ import pytest
 import torch_qpmpc as qm
 from tests.refused import refused
 from torch_qpmpc import QPError
-from torch_qpmpc.control.disturbance import Steady, choose
+from torch_qpmpc.control.disturbance import Steady, choose, chosen
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import read_model
 
@@ -84,6 +84,15 @@ def test_drifts_of_a_log_come_first_in_the_units_of_their_outputs():
     np.testing.assert_allclose(w.B, np.diag([0.21, 0.51, 0.0]), atol=1e-15)
     np.testing.assert_allclose(w.C, np.diag([0.0, 0.0, 1.0]))
     assert choose(replace(plant, drifts=shown), {"y1": "output"}).changes == 0
+
+
+@pytest.mark.parametrize("wanted", ["auto", None, {"y1": "u1"}, {"y1": "u2", "y2": "output"}])
+def test_what_a_user_chose_is_chosen_again_for_another_model(wanted):
+    """A model that learned from a log had the automatic ones."""
+    plant = read_model((np.diag([0.8, 0.5]), np.eye(2), np.ones((2, 2)) + np.eye(2)))
+    w, sizes = choose(plant, wanted), Scaling.of(plant)
+    assert choose(plant, chosen(plant, w, sizes), sizes).names == w.names
+    assert (chosen(plant, w, sizes) == "auto") is (wanted == "auto")
 
 
 def test_a_drift_that_is_an_integrating_input_s_takes_its_place():

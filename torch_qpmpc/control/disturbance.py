@@ -93,6 +93,17 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
     return _placed(plant, kinds)
 
 
+def chosen(plant: StateSpace, w: Disturbances, scaling: Scaling) -> Any:
+    """Return the argument by which `choose` returned w."""
+    if w.names and choose(plant, "auto", scaling).names == w.names:
+        return "auto"
+    named = [name.removeprefix(PREFIX) for name in w.names]
+    free = (name for name in plant.outputs if name not in named)
+    return {
+        next(free) if x in plant.inputs else x: x if x in plant.inputs else OUTPUT for x in named
+    }
+
+
 def _placed(plant: StateSpace, kinds: Mapping[str, Any]) -> Disturbances:
     """Return the disturbances of a mapping from outputs to "output", an input or a drift's number.
 

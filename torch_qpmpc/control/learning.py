@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
-from torch_qpmpc.control.disturbance import choose
+from torch_qpmpc.control.disturbance import choose, chosen
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import SMALL
@@ -226,7 +226,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     old = law.design
     plant = read_model(model, prices=old.linear.values())
     scaling = replace(old, plant=plant).scaling
-    w = choose(plant, "auto" if old.disturbances.names else None, scaling)
+    w = choose(plant, chosen(old.plant, old.disturbances, old.scaling), scaling)
     design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC.of_design(design, **law.mpc.options)
     return Law.of(mpc, law.noise, law.drift if w.names == old.disturbances.names else None)
