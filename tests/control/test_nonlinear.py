@@ -15,6 +15,7 @@ from tests.refused import refused
 from torch_qpmpc import QPError, SolverError
 from torch_qpmpc.control.state_space import read_model
 from torch_qpmpc.identification.learned import LearnedModel
+from torch_qpmpc.qp.pipeline import diagnosis
 
 NAMES: Any = {"inputs": ["hot", "cold"], "outputs": ["level", "T"]}
 OPTIONS: Any = {"Q": {"level": 1.0, "T": 0.01}, "dR": 0.1, "du_bounds": (-0.2, 0.2)}
@@ -150,8 +151,14 @@ def upright(x: Tensor, u: Tensor) -> Tensor:
     return torch.stack((x[..., 1], 9.81 * x[..., 0].sin() + u[..., 0] - 0.1 * x[..., 1]), -1)
 
 
-@pytest.mark.parametrize(("angle", "status"), [(0.0, 0), (1.5, 2)])
-def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(angle, status):
+@pytest.mark.parametrize(
+    ("angle", "status", "proven"), [(0.0, 0, True), (1.5, 2, True), (1.5, 1, False)]
+)
+def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(
+    angle, status, proven, monkeypatch
+):
+    if not proven:
+        monkeypatch.setattr(diagnosis, "_contradict", lambda *_: False)
     f, bounds = qm.RungeKutta(upright, 0.1), ([-1.0, -0.5], [0.9, 1.2])
     options: Any = {"u_bounds": (-14, 14), "y_bounds": bounds, "disturbances": {"y1": "u1"}}
     options |= {"Q": [1.0, 0.0], "dR": 0.01, "y_slack": np.inf}

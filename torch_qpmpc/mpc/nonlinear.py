@@ -364,7 +364,7 @@ class SequentialQP(nn.Module):
         far = ~(z.abs() < OVERFLOW).all(1)
         z[far, n_p:], costs[far] = 0.0, torch.inf
         pull, parts = fixed.new_full((B,), FIRST), []
-        bent, (converged, done) = torch.zeros_like(hard), torch.zeros(2, B, dtype=torch.bool)
+        (converged, done), failed = torch.zeros(2, B, dtype=torch.bool), torch.zeros_like(every)
         for _ in range(self.iterations):
             if not len(todo := (~done).nonzero().squeeze(1)) and parts:
                 break
@@ -377,7 +377,7 @@ class SequentialQP(nn.Module):
             near.q.sub_(size * z[todo])
             near.c.add_((size * z[todo] ** 2).sum(-1) / 2)
             solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
-            bent[todo] = stuck = (~solution.solved).unsqueeze(1) & hard[todo]
+            failed[todo], stuck = solution.status, (~solution.solved).unsqueeze(1) & hard[todo]
             if stuck.any():  # along a plan, rows may contradict each other that others keep
                 near = replace(near, w=torch.where(stuck, price[todo], near.w), check_values=False)
                 solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
@@ -413,8 +413,8 @@ class SequentialQP(nn.Module):
         parts[1][left] = z[left]
         parts[5][left[parts[0][left].isinf()]] = int(Status.INVALID_DATA)
         y = times(qp.G, parts[1])
-        over = bent & (torch.maximum(qp.lb - y, y - qp.ub) > SLIP * bound)
-        parts[5][over.any(1) & (parts[5] == 0)] = int(Status.INFEASIBLE)
+        over = (hard & (torch.maximum(qp.lb - y, y - qp.ub) > SLIP * bound)).any(1)
+        parts[5] = torch.where(over & (parts[5] == 0), failed, parts[5])
         return u, tuple(parts), converged
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:
