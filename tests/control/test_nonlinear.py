@@ -174,6 +174,19 @@ def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(
     assert status or abs(x[0] - 0.9) < 1e-3
 
 
+@pytest.mark.parametrize("bound", [None, 1e10])
+def test_a_set_point_above_what_a_saturating_valve_holds_is_tracked_as_near_as_it_can(bound):
+    f = qm.RungeKutta(lambda x, u: 1.2 * torch.tanh(u) - 0.6 * x.clamp(min=1e-4).sqrt(), 0.5)
+    options: Any = {"Q": 1.0, "dR": 0.3, "u_bounds": (bound and -bound, bound)}
+    own = qm.Controller(qm.LinearMPC((f, [1.0], [0.55]), 20, **options), noise=0.01)
+    x = torch.tensor([1.0]).double()
+    own.reset(y=x.numpy(), u=[0.55])
+    for r in [0.3] * 10 + [5.0] * 20 + [1.0] * 20:
+        x = f(x, torch.from_numpy(own.step(x.numpy(), r=[r])))
+        assert own.status == 0
+    assert_allclose(x, 1.0, atol=0.02)
+
+
 def test_a_run_from_a_state_where_the_model_has_no_slope_says_how_to_start():
     model = lambda x, u: x + 0.1 * (u - x.sqrt()), [1.0], [1.0]  # at rest with zero: empty
     own = qm.Controller(qm.LinearMPC(model, 5, Q=1.0, dR=0.1, u_bounds=(0.0, 2.0)))

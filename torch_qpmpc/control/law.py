@@ -245,6 +245,7 @@ class Law:
             plant = self.design.plant.at(np.concatenate((d, x, u + self.loads @ w)))
             own = self.design.disturbances._replace(B=plant.B @ self.loads)
             design = replace(self.design, plant=plant, disturbances=own)
+            vars(design)["scaling"] = self.design.scaling  # where inputs act on nothing, none is
             fixed = self.gain is not None
             observer = self.observer if fixed else kalman(design, self.noise, self.drift)
             mpc = LinearMPC.of_design(design, **self.mpc.options) if aims else self.mpc
