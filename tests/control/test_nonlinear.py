@@ -174,6 +174,51 @@ def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(
     assert status or abs(x[0] - 0.9) < 1e-3
 
 
+def grown(x: Tensor, u: Tensor) -> Tensor:
+    """Return the slopes of biomass and substrate in a fed tank, which too large a flow washes out.
+
+    Substrate that is left over inhibits the growth.
+    """
+    (X, S), (flow, feed) = x.unbind(-1), u.unbind(-1)
+    growth = 0.5 * S * X / (0.2 + S + S**2 / 2)
+    return torch.stack((growth - flow * X, flow * (feed - S) - growth / 0.4), -1)
+
+
+def tank() -> qm.Controller:
+    model = qm.RungeKutta(grown, 0.2), [1.1, 0.5], [0.2, 3.0]
+    options: Any = {"Q": 1.0, "dR": [0.1, 0.02], "u_bounds": ([0.0, 0.5], [0.6, 6.0])}
+    return qm.Controller(qm.LinearMPC(model, 15, **options), noise=0.01)
+
+
+def test_a_reset_and_a_run_start_at_the_models_own_point_wherever_the_loop_was():
+    own = tank()
+    first, run = own.mpc.design.plant.point, own.simulate(steps=2, r=[1.2, 0.5])
+    for _ in range(3):
+        own.step([1.0, 0.6], r=[0.6, 0.9])
+    assert np.abs(own.mpc.design.plant.point - first).max() > 0.1
+    assert_allclose(own.simulate(steps=2, r=[1.2, 0.5]).u, run.u)
+    own.redesign(dR=0.1)
+    own.reset()
+    assert_allclose(own.mpc.design.plant.point, first)
+
+
+@pytest.mark.parametrize("u", [None, [0.0]])
+def test_a_run_starts_with_the_resets_outputs_where_a_plant_rests_anywhere(u):
+    model = lambda x, u: x + 0.1 * torch.tanh(u), [0.0], [0.0]
+    own = qm.Controller(qm.LinearMPC(model, 10, Q=1.0, dR=0.1, u_bounds=(-2.0, 2.0)))
+    own.reset(y=[3.0])
+    assert_allclose(own.simulate(steps=1, r=[3.5], u=u).y[0], 3.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("u", [None, [0.1, 2.0]])
+def test_a_run_starts_at_a_rest_of_the_plant_though_the_models_point_is_none(u):
+    run = tank().simulate(steps=60, r=[1.2, 0.5], u=u, load=[0.01, 0.1])
+    (X, S), (flow, feed) = run.y[0], run.u_last
+    assert_allclose([X, 0.5 * S / (0.2 + S + S**2 / 2)], [0.4 * (feed - S), flow], atol=1e-6)
+    assert S > 0
+    assert_allclose(run.y[-1], [1.2, 0.5], atol=1e-2)
+
+
 @pytest.mark.parametrize("bound", [None, 1e10])
 def test_a_set_point_above_what_a_saturating_valve_holds_is_tracked_as_near_as_it_can(bound):
     f = qm.RungeKutta(lambda x, u: 1.2 * torch.tanh(u) - 0.6 * x.clamp(min=1e-4).sqrt(), 0.5)

@@ -84,7 +84,7 @@ class Controller:
         self, mpc: LinearMPC, *, noise: Any = None, drift: Any = None, gain: Any = None
     ) -> None:
         check_kind("mpc", mpc, LinearMPC, "qm.LinearMPC makes one of a plant's model.")
-        self._law = ready(Law.of(mpc, noise, drift, gain))
+        self._own = self._law = ready(Law.of(mpc, noise, drift, gain))  # the first, and the last
         self._start(self._law.begun())
 
     def reset(self, y: Any = None, u: Any = None, known: Any = None) -> None:
@@ -98,7 +98,7 @@ class Controller:
         Raises:
             QPError: an argument is invalid.
         """
-        self._law = law = ready(replace(self._law))  # with today's theta
+        self._own = self._law = law = ready(replace(self._own))  # with today's theta
         memory = law.begun(None if u is None else read_table("u", u, law.design.plant.inputs, 1)[0])
         memory = memory._replace(r=self.r)
         y = None if y is None else law.read("y", y, 1)[0]
@@ -224,9 +224,9 @@ class Controller:
         Raises:
             QPError: an argument is invalid or contradicts a minimum time, or the MPC learns.
         """
-        law = self._law.redesigned(**changes)
+        law = self._own.redesigned(**changes)
         law.check_runs(self._memory)
-        self._law = ready(law)
+        self._own = self._law = ready(law)
         u = np.clip(self.u, *self.mpc.design.u_bounds)
         self._memory, self._now = self._memory._replace(u=u), None
 
@@ -259,7 +259,7 @@ class Controller:
         if "observer" in parts:  # else a file of an earlier release
             parts["observer"] = Observer(**parts["observer"])
         controller = cls.__new__(cls)
-        controller._law = ready(replace(Law.of(mpc, *settings), **parts))
+        controller._own = controller._law = ready(replace(Law.of(mpc, *settings), **parts))
         controller._start(Memory(**state))
         return controller
 
@@ -286,7 +286,7 @@ class Controller:
             QPError: an argument is invalid.
             SolverError: no input satisfies the hard bounds in a step.
         """
-        return simulate(replace(self._law), self._memory, plant, steps, r, **options)
+        return simulate(replace(self._own), self._memory, plant, steps, r, **options)
 
     def learn(self, source: Any, transitions: int = 5000, **options: Any) -> LearningReport:
         """Identify the model again, and keep the new one if closed loops cost less with it.
@@ -317,7 +317,7 @@ class Controller:
         law = replace(self._law)
         report, candidate = learn(law, self._memory, source, transitions, **options)
         if report.accepted:
-            self._law = ready(candidate)
+            self._own = self._law = ready(candidate)
             steps = len(self._law.observer.gains) - 1  # from rest
             self._start(self._memory._replace(e=None, steps=steps))
         return report
@@ -346,7 +346,7 @@ class Controller:
             if faults:
                 notes = (f"With it, {x.name}: {x.text}." for x in faults)
                 return replace(report, kept=False, notes=(*report.notes, *notes))
-            self._law, self._now = law, None
+            self._own, self._law, self._now = law, law, None
         return report
 
     def review(self, r: Any = None, known: Any = None) -> Review:

@@ -528,9 +528,6 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
     """Read weights and bounds by their arguments' names in `LinearMPC`, with new limits.
 
     A mapping leaves what it does not name as the ``old`` design has it.
-
-    Raises:
-        QPError: one is invalid, or has another name.
     """
     y, u = plant.outputs, plant.inputs
     readers: dict[str, Any] = {"Q": (read_weight, y), "R": (read_weight, u), "dR": (read_weight, u)}
@@ -553,11 +550,7 @@ def read_wishes(plant: StateSpace, old: Design | None, **wishes: Any) -> dict[st
 
 
 def read_switching(u_levels: Any, plant: StateSpace, **rules: Any) -> dict[str, Any]:
-    """Read the levels of inputs by name, and as ``switching`` the arguments of `Bounds` for them.
-
-    Raises:
-        QPError: a name is no input with levels, or a level is no number.
-    """
+    """Read levels of inputs by name, and as ``switching`` the arguments of `Bounds` for them."""
     if not isinstance(u_levels, Mapping | None) or {*(u_levels or ())} - {*plant.inputs}:
         raise QPError.expected("u_levels", repr(u_levels), f"a mapping from {[*plant.inputs]}")
     if not u_levels:
@@ -624,11 +617,7 @@ def read_limits(
 
 
 def read_constraints(name: str, value: Any, names: Sequence[str]) -> dict[str, Constraint]:
-    """Read combinations of the signals ``names``, with bounds and prices, by a name of their own.
-
-    Raises:
-        QPError: one is no such tuple, or has an unknown signal.
-    """
+    """Read combinations of the signals ``names`` with bounds and prices, by a name of their own."""
     want = "(weights of signals by name, (lower, upper)), or these with the price of a violation"
     if not isinstance(value, Mapping | None):
         raise QPError.expected(name, repr(value), f"a mapping from names to {want}")

@@ -227,9 +227,6 @@ def _run(law: Law, course: dict[str, Any], act: Any, steps: int) -> Loop:
 
     Each policy closes a loop of its own: replaying outputs through an unstable controller would
     measure rounding alone.
-
-    Raises:
-        SolverError: no input satisfies the hard bounds in the first step.
     """
     rows, stages = [], slice(None if law.design.references == "preview" else 1)
     loop = closed_loop(law, Memory(course["u"]), None, steps, act=act, **course)

@@ -253,11 +253,7 @@ class Law:
         return self
 
     def aimed(self, r: Array, known: Array, w: Array) -> tuple[Law, Target]:
-        """Return the target, and the law of a nonlinear plant linearised there.
-
-        Raises:
-            SolverError: the target's QP has no solution.
-        """
+        """Return the target, and the law of a nonlinear plant linearised there."""
         law, target = self, self._target(r, known, w)
         for _ in range(0 if self.design.plant.dynamics is None else NEWTON):
             x, u = (np.atleast_2d(part)[-1] for part in target[:2])
@@ -331,11 +327,7 @@ class Law:
         return Move(u, self._after(memory, e, u), status, self)
 
     def _target(self, r: Array, known: Array, w: Array) -> Target:
-        """Return the `Target` for set-points and known signals by stage and an estimate of w.
-
-        Raises:
-            SolverError: its QP has no solution.
-        """
+        """Return the `Target` for set-points and known signals by stage and an estimate of w."""
         design, n_y = self.design, r.shape[1]
         known = known if design.staged else known[-1:]
         s = np.empty((len(known), n_y + len(w) + known.shape[1] + 1))
@@ -418,16 +410,14 @@ class Law:
 
     def rested(self, u: Array, d: Array, y: Array) -> Array:
         """Return the e that rests with u, d and y."""
-        plant, tries = self.design.plant, [self.observer.at_rest(u, d, y)]
+        plant, size = self.design.plant, self.design.scaling.x
         if plant.dynamics is None:
-            return tries[0]
-        for _ in range(NEWTON):
-            tries.append(self.at(tries[-1], u, d).observer.at_rest(u, d, y))
-        tries.append(self.observer.at_rest(plant.point[-len(u) :], d, y))
-        # Newton's method may diverge: of its points and the model's own the one that moves least.
-        n, size = len(plant.A), self.design.scaling.x
-        moves = [(np.abs(self.predicted(e, u, d) - e)[:n] / size).max() for e in tries]
-        return tries[np.nan_to_num(moves, nan=np.inf).argmin()]
+            return self.observer.at_rest(u, d, y)
+        return settled(
+            self.observer.at_rest(plant.point[-len(u) :], d, y),
+            lambda e: self.at(e, u, d).observer.at_rest(u, d, y),
+            lambda e: (self.predicted(e, u, d) - e)[: len(size)] / size,
+        )
 
     def _within(self, u: Array, memory: Memory, on_levels: bool = False) -> Array:
         """Return inputs within their bounds, numbers before known signals, or on levels there."""
@@ -497,6 +487,17 @@ class Law:
             remedy = f"If it is no error, measure {names[i]} in a larger unit."
             raise QPError.expected(name, got, want, remedy)
         return table
+
+
+def settled(x: Array, step: Callable[[Array], Array], off: Callable[[Array], Array]) -> Array:
+    """Return the x after Newton's method, whose ``step`` is shortened until x is less ``off``."""
+    shares = np.array([0.0, 1.0, 0.5, 0.25, 0.1])
+    with suppress(QPError):  # no slope there
+        for _ in range(NEWTON):
+            tries = x + shares[:, None] * (step(x) - x)
+            sizes = np.array([np.abs(off(z)).max() for z in tries]) / (1 - shares / 2)
+            x = tries[np.nan_to_num(sizes, nan=np.inf).argmin()]
+    return x
 
 
 def _deviations(name: str, value: Any, default: Array, names: tuple[str, ...]) -> Array:

@@ -11,7 +11,7 @@ import torch
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
-from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals
+from torch_qpmpc.control.law import PLANNED, Law, Memory, Signals, settled
 from torch_qpmpc.control.scaling import FAINT, Scaling
 from torch_qpmpc.control.state_space import Array, StateSpace, read_model, read_table, read_vector
 from torch_qpmpc.errors import QPError, SolverError
@@ -127,7 +127,17 @@ def closed_loop(
         model = design.plant if plant is None else read_model(plant)
         own = _known(model, design, d)
         scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
-        rest = scaling.at_rest(model, u, own[0], memory.rest[0], near)
+        held, y = (u, own[0]), memory.rest[0]
+        y, near = (np.zeros(len(model.C)), 0.0) if y is None else (y, near)
+        rest = scaling.at_rest(model, *held, y, near)
+        if model.dynamics is not None:
+            rest = settled(
+                model.point[len(own[0]) :][: len(rest)],
+                lambda x: scaling.at_rest(model.at(np.concatenate((own[0], x, u))), *held, y, near),
+                lambda x: np.append(
+                    (model.after(x, *held) - x) / scaling.x, near * (model.C @ x - y) / scaling.y
+                ),
+            )
         states = [f"x{i + 1}" for i in range(len(model.A))]
         plant = _Model(model, own, rest if x is None else read_vector("x", x, states, 0.0))
     entropy = seed if isinstance(plant, _Model) else (seed, 1)  # an environment draws from seed
