@@ -300,6 +300,9 @@ def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path):
     twin = qm.Controller.load(tmp_path / "own.qpmpc")
     for _ in range(3):
         assert_allclose(twin.step([1.9], r=[1.5]), own.step([1.9], r=[1.5]), rtol=1e-9)
+    for each in (own, twin):
+        each.reset(y=[1.0])
+    assert_allclose(twin.mpc.design.plant.point, own.mpc.design.plant.point, rtol=1e-12)
 
 
 def test_a_loop_starts_at_the_models_point():

@@ -238,8 +238,9 @@ class Controller:
             OSError: writing failed; the old file is unchanged.
         """
         parts = {name: getattr(self._law, name) for name in PARTS}
+        parts["point"] = self._law.design.plant.point
         state = packed(parts | self._memory._asdict())
-        save_file(path, KIND, {**self.mpc.stored(), "controller": state})
+        save_file(path, KIND, {**self._own.mpc.stored(), "controller": state})
 
     @classmethod
     def load(cls, path: str | Path) -> Controller:
@@ -258,8 +259,10 @@ class Controller:
         mpc, settings = LinearMPC.of_stored(content), (parts.get(x) for x in SETTINGS)
         if "observer" in parts:  # else a file of an earlier release
             parts["observer"] = Observer(**parts["observer"])
-        controller = cls.__new__(cls)
-        controller._own = controller._law = ready(replace(Law.of(mpc, *settings), **parts))
+        controller, own = cls.__new__(cls), Law.of(mpc, *settings)
+        law = own if (point := state.pop("point", None)) is None else own.around(point, aims=True)
+        controller._law = law = ready(replace(law, **parts))
+        controller._own = law if point is None else own
         controller._start(Memory(**state))
         return controller
 

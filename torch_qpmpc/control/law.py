@@ -241,8 +241,12 @@ class Law:
         if e is None or d is None or self.design.plant.dynamics is None:
             return self
         x, w = np.split(e, [len(self.design.plant.A)])
+        return self.around(np.concatenate((d, x, u + self.loads @ w)), aims)
+
+    def around(self, point: Array, aims: bool) -> Law:
+        """Return the law of a nonlinear plant linearised at a point [d; x; u]; see `at`."""
         with suppress(QPError):
-            plant = self.design.plant.at(np.concatenate((d, x, u + self.loads @ w)))
+            plant = self.design.plant.at(point)
             own = self.design.disturbances._replace(B=plant.B @ self.loads)
             design = replace(self.design, plant=plant, disturbances=own)
             vars(design)["scaling"] = self.design.scaling  # where inputs act on nothing, none is
