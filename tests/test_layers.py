@@ -30,7 +30,7 @@ BUDGET = {
     "analysis": 846,
     "control": 4860,  # nonlinear plants, drifts as disturbances
     "envs": 1346,
-    "experiment": 2724,
+    "experiment": 2705,
     "export": 1431,
     "learning": 2791,  # models that did not train theta decide in improve
     "identification": 2787,  # drifts keep steady gains right

@@ -28,7 +28,7 @@ from torch_qpmpc.experiment.tasks import find_task, make_physics
 PAGE, RESULTS = (DOCS / "results" / f"improvement.{end}" for end in ("md", "csv"))
 #: Seeds of the runs, and of the evaluation.
 SEEDS, EVAL_SEED = range(711, 721), 9003
-COMMON = ("solver=daqp", "figures=false", "logger=csv", f"eval_seed={EVAL_SEED}", "start=data")
+COMMON = ("solver=daqp", "figures=false", f"eval_seed={EVAL_SEED}", "start=data")
 COMMON += (f"rivals=[{IDENTIFICATION}]", "gate=false")
 COSTS = ("start", IDENTIFICATION, "other", "learned", "true model", "reference")
 

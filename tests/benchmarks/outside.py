@@ -321,9 +321,7 @@ def configuration(name: str, seed: int, *overrides: str) -> Any:
     """Compose the configuration of a plant's documented command."""
     plant = PLANTS[name]
     own = ("task=gymnasium", f"task.id={plant.id}", "start=data", f"seed={seed}")
-    return run_code(
-        compose_config(*own, "figures=false", "logger=csv", *plant.overrides, *overrides)
-    )
+    return run_code(compose_config(*own, "figures=false", *plant.overrides, *overrides))
 
 
 def reference(plant: Outside) -> float:

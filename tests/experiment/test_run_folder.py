@@ -1,7 +1,6 @@
 """A run's folder holds everything that was logged, also if the run is interrupted."""
 
 import errno
-import importlib.util
 import json
 import math
 import os
@@ -47,35 +46,6 @@ def test_folder_has_everything_logged(tmp_path, monkeypatch):
     assert "NaN" not in (folder / "summary.json").read_text(), "it is strict JSON"
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == {"J_final": 700, "closed_gap": None, "rivals": {"zero": None}}
-
-
-@pytest.mark.parametrize(
-    ("name", "files"),
-    [
-        ("csv", "csv/scalars/loss/value.csv"),
-        ("wandb", "wandb/offline-run-*/*.wandb"),
-    ],
-)
-def test_each_logger_writes_into_the_folder(tmp_path, monkeypatch, name, files):
-    if name != "csv":
-        pytest.importorskip(name, reason=f"the extra {name} is not installed")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    cfg = make_config(f"logger={name}", "log_interval=1", "eval_interval=3")
-    for after in (None, 3):
-        with RunFolder(tmp_path, cfg, after) as run:
-            for update in range(5):
-                run.log({"loss/value": 1 / (update + 1)}, update)
-    assert len([*tmp_path.glob(files)]) == 1 + (name != "csv"), "one for each start"
-    assert not (tmp_path / "tensorboard").exists()
-
-
-def test_a_logger_that_is_not_installed_is_named_before_anything_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    message = "^logger: got wandb, which is not installed, .* Install it: pip install wandb.$"
-    with pytest.raises(QPError, match=message):
-        train.train(make_config("logger=wandb"), str(tmp_path))
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(not PAGE.exists(), reason="no docs, as in a wheel's tests")

@@ -88,7 +88,7 @@ def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
 def gated(tmp_path_factory):
     """Train a run whose learned policy is in best.pt."""
     folder = tmp_path_factory.mktemp("gated")
-    more = ("gate=true", "logger=csv", "constraint=mpc")
+    more = ("gate=true", "constraint=mpc")
     train.train(make_config(*SMALL, *more), str(folder), quiet=True)
     return folder
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import functools
-import importlib.util
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, Self, get_args
 
@@ -148,13 +147,6 @@ class FromData(Group):
     hold: Annotated[float, Field(ge=1)]
 
 
-def _installed_logger(name: str) -> str:
-    if name == "wandb" and importlib.util.find_spec(name) is None:
-        got, remedy = f"{name}, which is not installed", f"Install it: pip install {name}."
-        raise QPError.expected("logger", got, "an installed logger", remedy)
-    return name
-
-
 def _settings_of_the_task(value: Any) -> TaskSettings:
     if not isinstance(value, Mapping):
         raise QPError.expected("task", repr(value), "its keys, as in configs/task/")
@@ -200,7 +192,6 @@ class Config(Group):
     gate: Literal["act", "plant"] | bool
     gate_bound: Positive | None
     gate_interval: Count | None
-    logger: Annotated[Literal["tensorboard", "csv", "wandb"], AfterValidator(_installed_logger)]
     figures: bool
     rivals: bool | list[str]
     eval_interval: Count

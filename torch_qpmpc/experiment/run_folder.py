@@ -1,4 +1,4 @@
-"""A run's folder: config.yaml, metrics.csv, the logger's files, checkpoint.pt, summary.json."""
+"""A run's folder: config.yaml, metrics.csv, TensorBoard's files, checkpoint.pt, summary.json."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 from omegaconf import OmegaConf
-from torchrl.record.loggers import Logger, get_logger
+from torchrl.record.loggers import TensorboardLogger
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config, flatten
@@ -29,8 +29,8 @@ NUMBERS += ("canonical_distance",)
 class RunFolder:
     """The output of one run; a context manager, which flushes at its end.
 
-    Scalars go to metrics.csv and to one of TorchRL's loggers. A resumed run keeps the rows up to
-    the update ``after``, None in a new one; `QPError` where they are damaged.
+    Scalars go to metrics.csv and to TensorBoard. A resumed run keeps the rows up to the update
+    ``after``, None in a new one; `QPError` where they are damaged.
     """
 
     def __init__(self, folder: str | Path, cfg: Config, after: int | None = None) -> None:
@@ -44,7 +44,7 @@ class RunFolder:
         if after is None:
             text = OmegaConf.to_yaml(cfg.model_dump(exclude_unset=True))
             write_whole(self.path / "config.yaml", text.encode())
-        self.logger = make_logger(cfg, self.path)
+        self.logger = TensorboardLogger("tensorboard", str(self.path))
 
     def __enter__(self) -> RunFolder:
         return self
@@ -56,7 +56,7 @@ class RunFolder:
             self.logger.close()
 
     def log(self, metrics: Mapping[str, float], update: int) -> None:
-        """Log scalars at an update, to metrics.csv and the logger."""
+        """Log scalars at an update, to metrics.csv and TensorBoard."""
         if not metrics:
             return
         if not self.rows or self.rows[-1]["update"] != update:
@@ -70,7 +70,7 @@ class RunFolder:
         return [row["update"] for row in rows], [row[name] for row in rows]
 
     def flush(self) -> None:
-        """Write metrics.csv and flush the logger."""
+        """Write metrics.csv and flush TensorBoard's events."""
         table = pd.DataFrame(self.rows).to_csv(index=False)
         write_whole(self.path / "metrics.csv", table.encode())
         self.logger.flush()
@@ -81,16 +81,6 @@ class RunFolder:
         text = json.dumps(finite, indent=2, allow_nan=False)
         # Written last and atomically: its presence marks the run as finished.
         write_whole(self.path / "summary.json", f"{text}\n".encode())
-
-
-def make_logger(cfg: Config, folder: Path) -> Logger:
-    """Make TorchRL's logger of ``cfg.logger`` in a run's folder, with the settings."""
-    name = cfg.logger
-    logger = get_logger(name, str(folder), folder.name if name == "wandb" else name)
-    assert logger is not None
-    if name != "tensorboard":  # whose hyper-parameters begin a folder of their own
-        logger.log_hparams({key: str(value) for key, value in cfg.settings.items()})
-    return logger
 
 
 def read_config(folder: str | Path) -> Config:

@@ -50,7 +50,7 @@ NEW = "Pass begins=True to begin other episodes."
 #: Smallest J_start - J_true_model for which the closed gap is meaningful, as a share of J_start.
 REAL_GAP = 0.5
 #: Settings that labels leave out: they vary within a case, or do not affect learning.
-_UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "logger", "rivals")
+_UNLABELLED = ("seed", "figures", "threads", "log_interval", "eval_interval", "rivals")
 
 
 class FinishedRun:
