@@ -102,6 +102,8 @@ def test_a_drift_that_is_an_integrating_input_s_takes_its_place():
     assert full_rank(plant, w)
     hidden = choose(replace(plant, drifts=np.array([[0.0], [0.0], [0.01]])))
     assert hidden.names == ("disturbance of u1",), "an output's cannot be told from the mode"
+    faint = choose(replace(read_model(STABLE), drifts=np.array([[-0.1], [0.0], [1.0005]])))
+    assert faint.changes == 0, "it moves no output in the end, or hardly"
 
 
 @refused(

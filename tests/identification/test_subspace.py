@@ -107,6 +107,20 @@ def test_the_steady_gain_is_the_plants_where_the_level_drifts(pole, walk, seed):
     assert f"of which no input moves {found.fit.drifts}" in str(found)
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_load_that_drifts_is_told_from_the_level_that_it_moves(seed):
+    """The two modes at one seemed a pair, of which the input moves a part: loops were unstable."""
+    rng, x, load, y, u = np.random.default_rng(seed), 0.0, 0.0, [], []
+    for k in range(1000):
+        y.append(x + 0.01 * rng.normal())
+        u.append(u[-1] if k % 5 else np.clip(-y[-1] + 0.6 * rng.uniform(-1, 1), -1, 1))
+        load += 0.01 * rng.normal()
+        x += 0.05 * (u[-1] + load)
+    fit = qm.identify({"y": np.array(y), "u": np.array(u)}).fit
+    assert (fit.order, fit.drifts) == (2, 1)
+    assert pytest.approx(0.05, rel=0.02) == fit.plant[0].B
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 def test_a_slow_mode_that_inputs_move_is_none_of_the_drifts(noise):
     """Its gain is known to the accuracy of a log of three of its times."""

@@ -41,6 +41,8 @@ TIE = 1e-6
 TINY = 1e-300
 #: Modes this near to one integrate: an output disturbance is hard to tell from their drift.
 INTEGRATES = 1e-2
+#: A singular value below tells disturbances from the state too badly.
+HIDDEN = 1e-3
 #: The least weight of a direction of f, relative to the largest.
 REGULARISATION = 1e-3
 OUTPUT, PREFIX = "output", "disturbance of "
@@ -81,7 +83,8 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
         logged = normal.drifts
         for drifts, near in product((logged, logged[:, :0]), (INTEGRATES, RANK)):
             kinds = _automatic(normal, near, drifts)
-            if _hidden(normal, _placed(normal, kinds)) is None:
+            w, least = _placed(normal, kinds), HIDDEN * bool(drifts.size)
+            if _hidden(normal, w) is None and told_apart(normal, w)[0] > least:
                 break
     elif not isinstance(wanted, Mapping):
         raise QPError.expected("disturbances", repr(wanted), "'auto', None or a mapping")
@@ -128,6 +131,13 @@ def _placed(plant: StateSpace, kinds: Mapping[str, Any]) -> Disturbances:
         changes.append(change)
     B, C = np.split(np.array(columns).reshape(-1, n + n_y).T, [n])
     return Disturbances(B, C, (*names,), np.array(changes))
+
+
+def told_apart(plant: StateSpace, w: Disturbances) -> tuple[float, Array]:
+    """Return the least singular value of [A - I, B_w; C, C_w], and its direction."""
+    matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
+    _, sizes, V = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), TINY))
+    return float(sizes[-1]), V[-1]
 
 
 def _effect(plant: StateSpace, drifts: Array) -> Array:

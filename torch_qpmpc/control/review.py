@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
 from torch_qpmpc.control.design import DECIDES, Design, Target
-from torch_qpmpc.control.disturbance import choose, unseen_modes
+from torch_qpmpc.control.disturbance import HIDDEN, choose, told_apart, unseen_modes
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_loop import LinearLoop
 from torch_qpmpc.control.linear_mpc import LinearMPC
@@ -20,7 +20,7 @@ from torch_qpmpc.control.state_space import Array
 from torch_qpmpc.errors import QPError, SolverError
 
 #: A number beyond these is a fault. A modulus margin of 0.5 is the usual aim.
-MARGIN, HIDDEN = 0.3, 1e-3
+MARGIN = 0.3
 #: The most that the log's noise moves outputs, relative to constant inputs, and inputs in bounds.
 NOISY, BUSY = 1.25, 1 / 6  # of their distance: three deviations reach from the middle to an end
 #: Offsets of the loop and ends of the reach, of set-points, and of outputs from their bounds while
@@ -203,11 +203,10 @@ def _disturbances(design: Design) -> Finding:
     plant, w = design.normal.plant, design.normal.disturbances
     if not w.names:
         return Finding("disturbances", True, "None is estimated.")
-    matrix = np.block([[plant.A - np.eye(len(plant.A)), w.B], [plant.C, w.C]])
-    _, sizes, V = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
-    ok, hidden = bool(sizes[-1] > HIDDEN), np.abs(V[-1, len(plant.A) :]).argmax()
+    size, direction = told_apart(plant, w)
+    ok, hidden = size > HIDDEN, np.abs(direction[len(plant.A) :]).argmax()
     text = f"The outputs {'' if ok else 'hardly '}tell the {', '.join(w.names)} from the state "
-    text += f"(singular value {sizes[-1]:.2g})."
+    text += f"(singular value {size:.2g})."
     remedy = f"Take disturbances='auto': the {w.names[hidden]} looks like a slow mode."
     if not ok and choose(design.plant, "auto", design.scaling).names == w.names:
         remedy = "Take a model of smaller order: this one has a slow mode that inputs hardly move."

@@ -175,7 +175,7 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
     most, full = likeliest(par, data)
     while drifts < n_y:
         own, found = len(par.A) - drifts, []
-        for modes in _slow_modes(full.A[:own, :own]):
+        for modes in _slow_modes(full.A[:own, :own], full.B[:own]):
             if (count := drifts + len(modes)) <= n_y:
                 lost = least[len(modes) - 1]
                 value, one = likeliest(_with_drifts(full, modes), data, count, most - lost)
@@ -188,12 +188,18 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
     return par, drifts
 
 
-def _slow_modes(A: Array) -> list[Array]:
-    """Return bases ``(1 or 2, n)`` of the left eigenvectors of a mode, or of a pair, near one."""
+def _slow_modes(A: Array, B: Array) -> list[Array]:
+    """Return bases ``(1 or 2, n)`` of the left eigenvectors of a mode, or of a pair, near one.
+
+    Of a pair, which a drift and an integrator may seem, there is the direction, too, that inputs
+    move least.
+    """
     values, left = scipy.linalg.eig(A, left=True, right=False)
     near = np.flatnonzero((np.abs(values - 1) < SLOW) & (values.imag >= 0))
     both = ((values[i], left[:, i]) for i in near)
-    return [np.stack((x.real, x.imag) if value.imag else (x.real,)) for value, x in both]
+    bases = [np.stack((x.real, x.imag) if value.imag else (x.real,)) for value, x in both]
+    pairs = (np.linalg.qr(basis.T)[0].T for basis in bases if len(basis) == 2)
+    return bases + [np.linalg.svd(pair @ B[:, :-1])[0][:, -1:].T @ pair for pair in pairs]
 
 
 def _with_drifts(par: Noisy, modes: Array) -> Noisy:
