@@ -22,8 +22,9 @@ from torch_qpmpc.identification.innovations import Innovations
 
 #: The gain of the log-likelihood per step that ends expectation maximisation.
 STALLED = 1e-4
-#: A mode, or a pair, this near to one may be a drift. It forgets at least the share FORGETS a step.
-SLOW, FORGETS = 0.2, 1e-3
+#: A mode, or a pair, this near to one may be a drift, which forgets at least the share FORGETS a
+#: step. A pair as near as TWINS may be one and an integrator.
+SLOW, FORGETS, TWINS = 0.2, 1e-3, 0.05
 #: The level of the test that inputs move a mode; extrapolations of its fits, and the gain per step
 #: that ends them.
 LEVEL, CYCLES, LEFT = 0.01, 100, 1e-6
@@ -195,11 +196,14 @@ def _slow_modes(A: Array, B: Array) -> list[Array]:
     move least.
     """
     values, left = scipy.linalg.eig(A, left=True, right=False)
-    near = np.flatnonzero((np.abs(values - 1) < SLOW) & (values.imag >= 0))
-    both = ((values[i], left[:, i]) for i in near)
-    bases = [np.stack((x.real, x.imag) if value.imag else (x.real,)) for value, x in both]
-    pairs = (np.linalg.qr(basis.T)[0].T for basis in bases if len(basis) == 2)
-    return bases + [np.linalg.svd(pair @ B[:, :-1])[0][:, -1:].T @ pair for pair in pairs]
+    found = []
+    for i in np.flatnonzero((np.abs(values - 1) < SLOW) & (values.imag >= 0)):
+        x = left[:, i]
+        found.append(np.stack((x.real, x.imag) if values[i].imag else (x.real,)))
+        if values[i].imag and abs(values[i] - 1) < TWINS:
+            pair = np.linalg.qr(found[-1].T)[0].T
+            found.append(np.linalg.svd(pair @ B[:, :-1])[0][:, -1:].T @ pair)
+    return found
 
 
 def _with_drifts(par: Noisy, modes: Array) -> Noisy:
