@@ -72,6 +72,16 @@ def test_bounds_far_away_of_an_input_without_a_cost_set_no_size(plant, Q):
     assert np.allclose(far[0], moves(plant, **options)[0], atol=1e-9)
 
 
+def test_bounds_set_no_unit_of_the_riccati_equation():
+    bounds = {"y_bounds": (-1e5, 1e5), "u_bounds": {"u2": (-0.1, 0.1)}}
+    model = [[1.1]], [[1.0, 0.5]], [[1.0]]
+    own, far = (
+        riccati(qm.LinearMPC(model, 3, Q=1.0, R=0.1, dR=[0.5, 1.0], **x).design)
+        for x in ({}, bounds)
+    )
+    assert np.allclose(far, own, rtol=1e-9)
+
+
 def test_the_slope_of_a_direction_without_a_cost_is_zero():
     """Inputs that rest hold the output at zero: the cost to go of a state at rest is none."""
     model = np.diag([0.9, 0.5]), [[0.1], [0.5]], [[1.0, -1.0]]

@@ -30,7 +30,8 @@ from scipy.linalg import block_diag
 
 from torch_qpmpc.control.design import Design, Target
 from torch_qpmpc.control.disturbance import RANK, null_direction, unseen_modes
-from torch_qpmpc.control.state_space import Array
+from torch_qpmpc.control.scaling import Scaling
+from torch_qpmpc.control.state_space import Array, StateSpace
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.bounds import Bounds
 from torch_qpmpc.mpc.cost import Cost
@@ -151,22 +152,30 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
 
 
 def riccati(design: Design) -> Array | None:
-    """Return the cost to go of [x; u_last] about a steady state, None if it does not exist."""
-    design, (_, of_u, of_x, _) = design.normal, design.scaling
-    plant, m = design.plant, design.plant.sizes[1]
-    if _costless(design):
+    """Return the cost to go of [x; u_last] about a steady state, None if it does not exist.
+
+    It has no bounds, so they set no unit in which it is computed.
+    """
+    scaling = Scaling.of(design.plant, Q=design.Q, steps=design.horizon)
+    of_y, of_u, of_x, _ = scaling
+    plant, m, gamma = scaling.plant(design.plant), len(of_u), design.gamma
+    Q, R, dR = (
+        2 * weight * np.outer(of, of)
+        for weight, of in ((design.Q, of_y), (design.R, of_u), (design.dR, of_u))
+    )
+    if _costless(plant, Q, R, gamma):
         return None
     A, B, S = plant.A, plant.B, np.zeros_like(plant.B)
-    Q, R = 2 * plant.C.T @ design.Q @ plant.C, 2 * (design.R + design.dR)
+    Q, R = plant.C.T @ Q @ plant.C, R + dR
     if design.moves:
         A, B = block_diag(A, np.zeros((m, m))), np.vstack((B, np.eye(m)))
-        Q, S = block_diag(Q, 2 * design.dR), np.vstack((S, -2 * design.dR))
+        Q, S = block_diag(Q, dR), np.vstack((S, -dR))
     A, B, W = (torch.as_tensor(x) for x in (A, B, np.block([[Q, S], [S.T, R]])))
     try:
-        P, K = riccati_weight(A, B, W, design.gamma), lqr_gain(A, B, W, design.gamma)
+        P, K = riccati_weight(A, B, W, gamma), lqr_gain(A, B, W, gamma)
     except (QPError, RuntimeError):  # the latter of a singular matrix
         return None
-    radius = torch.linalg.eigvals(A - B @ K).abs().max() * design.gamma**0.5
+    radius = torch.linalg.eigvals(A - B @ K).abs().max() * gamma**0.5
     eigenvalues, rounding = torch.linalg.eigvalsh(P), TINY * W.diagonal().max()
     exists = radius < 1 - 1e-9 and eigenvalues[0] >= -max(1e-9 * eigenvalues[-1].abs(), rounding)
     P, sizes = P.numpy(), np.concatenate((of_x, of_u))[: len(P)]
@@ -175,20 +184,19 @@ def riccati(design: Design) -> Array | None:
     return P / np.outer(sizes, sizes) if exists else None
 
 
-def _costless(design: Design) -> bool:
-    """Return True if a mode on the unit circle is not observable in a normal design's cost.
+def _costless(plant: StateSpace, Q: Array, R: Array, gamma: float) -> bool:
+    """Return True if a mode on the unit circle is not observable in the cost.
 
     Then rounding alone decides what a solver of the Riccati equation returns.
     """
-    plant, root = design.plant, design.gamma**0.5
     n, m = plant.B.shape
-    weighted = design.Q @ plant.C
-    modes = unseen_modes(root * plant.A, weighted)
+    weighted = Q @ plant.C
+    modes = unseen_modes(gamma**0.5 * plant.A, weighted)
     if any(abs(eigenvalue) < 1 + ON_CIRCLE for eigenvalue, _ in modes):
         return True
     balance = np.hstack((plant.A - np.eye(n), plant.B))
-    shown = np.pad(weighted, ((0, 0), (0, m))), np.pad(design.R, ((0, 0), (n, 0)))
-    return design.gamma == 1 and null_direction(balance, *shown) is not None
+    shown = np.pad(weighted, ((0, 0), (0, m))), np.pad(R, ((0, 0), (n, 0)))
+    return gamma == 1 and null_direction(balance, *shown) is not None
 
 
 def _bounds(design: Design) -> Bounds:
