@@ -48,7 +48,6 @@ def learned(references: str = "held", rate: float = 1e-3, **options) -> qm.Linea
 def load(
     files: Iterable[Path], controller: qm.Controller, name: str = "policy", dtype: str = "float64"
 ) -> CompiledController:
-    """Compile the files of an export."""
     texts = {x.name: x.read_text() for x in files if x.suffix in (".c", ".h")}
     return CompiledController(texts, name, dtype, len(controller.u))
 
@@ -151,7 +150,6 @@ def matrices(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 
 
 def designed(plant: Plant, seed: int, **options: Any) -> qm.Controller:
-    """Return a controller of the plant."""
     rng = np.random.default_rng([seed, 1])
     m = plant.B.shape[1]
     mpc = qm.LinearMPC(

@@ -35,7 +35,6 @@ def two_signals() -> qm.Controller:
 
 
 def driven() -> qm.Controller:
-    """Return the controller of a plant with a known signal."""
     options: Any = {"u_bounds": (-9.0, 9.0), "known": ["d"], "E": [[0.1]]}
     return qm.Controller(qm.LinearMPC(([[0.9]], [[0.25]]), 8, Q=1.0, dR=0.1, **options))
 
@@ -240,28 +239,18 @@ def test_a_step_without_a_plan_holds_the_input_whatever_the_mpc_does_on_failure(
     assert torch.equal(controller.p, plan[1])
 
 
-# New bounds and weights
+# New bounds
 
 
-def test_new_bounds_and_weights_keep_the_estimates():
-    controller, x = tanks(), np.array([10.0, 10.0])
-    changed = {"u_bounds": (0.0, 6.0), "du_bounds": (-0.2, 0.2), "dR": {"q": 1.0}}
+def test_new_bounds_keep_the_estimates_and_clip_the_input():
+    controller = tanks()
     controller.reset(y=[10.0], u=[4.0])
-    for k in range(60):
-        u = controller.step(x[1:], [14.0])
-        x = A @ x + B @ (u - 0.5)
-        if k == 30:
-            before = np.concatenate((controller.x, controller.w))
-            controller.redesign(**changed)
-            assert np.array_equal(before, np.concatenate((controller.x, controller.w)))
-        if k > 30:
-            assert 0 <= u[0] <= 6.0
-    fresh, now = (one.mpc.plan.quadratic_program() for one in (tanks(**changed), controller))
-    assert all(map(torch.equal, fresh.tensors(), now.tensors()))
+    controller.step([10.5], [14.0])
+    before = np.concatenate((controller.x, controller.w))
     controller.redesign(u_bounds=(0.0, 3.0))
+    assert np.array_equal(before, np.concatenate((controller.x, controller.w)))
     assert controller.u[0] == 3.0
-    assert controller.step(x[1:], [14.0])[0] <= 3.0
-    assert controller.mpc.design.du_bounds[1][0] == 0.2
+    assert controller.step([10.8], [14.0])[0] <= 3.0
     with pytest.raises(TypeError, match="unexpected keyword argument 'ubounds'; did you mea"):
         controller.redesign(ubounds=(0.0, 1.0))
 

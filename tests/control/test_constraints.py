@@ -1,6 +1,5 @@
 """Mixed and terminal constraints of a `LinearMPC`, beside QPs of the tests' own and in C."""
 
-import re
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.linalg import block_diag
 import torch_qpmpc as qm
 from tests.campaign.soak import soak
 from tests.control.controllers import exported
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.control.simulation import Run
 
 A, B = np.diag([0.9, 0.7]), np.array([[0.3, 0.1], [-0.1, 0.4]])
@@ -29,7 +28,6 @@ def made(horizon: int = N, **options: Any) -> qm.Controller:
 
 
 def rows_of(constraint: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return the factors of y and u, the bounds and the price of a constraint."""
     weights, (lower, upper), *price = constraint
     W = np.array([weights.get(x, 0.0) for x in (*NAMES["outputs"], *NAMES["inputs"])])
     bounds = [-np.inf if lower is None else lower, np.inf if upper is None else upper]
@@ -105,7 +103,6 @@ def test_c_keeps_them_alike():
 
 
 def bounded(**options: Any) -> qm.Controller:
-    """Return a controller with all constraints."""
     own = {"constraints": {**HARD, **SOFT}, "terminal_constraints": ENDS, **options}
     return made(8, y_bounds={"p": (-1.5, 1.5)}, du_bounds=(-0.8, 0.8), **own)
 
@@ -131,37 +128,19 @@ def test_they_are_saved_explained_and_paid_for(tmp_path):
     assert not {*controller.mpc.design.bands.names} & {"mixed", "end"}
 
 
-@pytest.mark.parametrize(
-    ("constraints", "message"),
-    [
-        ([1.0], "constraints: got [1.0], expected a mapping from names to (weights of signals"),
-        ({"a": 1.0}, "constraints: got 'a': 1.0, expected (weights of signals by name, (lower"),
-        ({"a": ({}, (0, 1))}, "constraints: got 'a': ({}, (0, 1)), expected (weights of signals"),
-        (
-            {"a": ({"heat": 1.0}, (0, 1))},
-            "constraints: got 'heat', expected names among T, p, heat",
-        ),
-        (
-            {"a": ({"T": np.inf}, (0, 1))},
-            "constraints: got 'a': ({'T': inf}, (0, 1)), expected (we",
-        ),
-        (
-            {"a": ({"T": 1.0}, (1, 0))},
-            "constraints: got (1, 0) for a, expected lower <=",
-        ),
-        (
-            {"a": ({"T": 1.0}, (0, 1), -1.0)},
-            "constraints: got 'a': ({'T': 1.0}, (0, 1), -1.0), exp",
-        ),
-    ],
+@refused(
+    ([1.0], r"constraints: got \[1.0\], expected a mapping from names to \(weights of signals"),
+    ({"a": 1.0}, r"constraints: got 'a': 1.0, expected \(weights of signals by name, \(lower"),
+    ({"a": ({}, (0, 1))}, r"constraints: got 'a': \({}, \(0, 1\)\), expected \(weights of signals"),
+    ({"a": ({"heat": 1.0}, (0, 1))}, "constraints: got 'heat', expected names among T, p, heat"),
+    ({"a": ({"T": np.inf}, (0, 1))}, r"constraints: got 'a': \({'T': inf}, \(0, 1\)\), expected"),
+    ({"a": ({"T": 1.0}, (1, 0))}, r"constraints: got \(1, 0\) for a, expected lower <="),
+    ({"a": ({"T": 1.0}, (0, 1), -1.0)}, r"constraints: got 'a': .* \(0, 1\), -1.0\), exp"),
 )
-def test_a_wrong_constraint_is_named(constraints, message):
-    with pytest.raises(QPError, match=f"^{re.escape(message)}"):
-        made(constraints=constraints)
+def test_a_wrong_constraint_is_named(constraints):
+    made(constraints=constraints)
 
 
-def test_a_terminal_constraint_has_outputs_alone():
-    with pytest.raises(
-        QPError, match=r"^terminal_constraints: got 'fan', expected names among T, p"
-    ):
-        made(terminal_constraints={"a": ({"T": 1.0, "fan": 1.0}, (0, 1))})
+@refused(({"T": 1.0, "fan": 1.0}, "terminal_constraints: got 'fan', expected names among T, p"))
+def test_a_terminal_constraint_has_outputs_alone(weights):
+    made(terminal_constraints={"a": (weights, (0, 1))})

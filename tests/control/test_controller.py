@@ -32,14 +32,6 @@ def closed_loop(controller, r, steps, load=0.0, bias=0.0, **options):
     return np.array(us), np.array(ys)
 
 
-def test_constant_disturbances_of_input_and_output_leave_no_offset():
-    us, ys = closed_loop(qm.Controller(integrator()), [2.0], 200, load=0.3, bias=-0.4)
-    assert np.abs(ys[-1] - 2.0) < 1e-8
-    assert np.abs(us[-1] + 0.3) < 1e-8
-    assert np.abs(us).max() <= 1.0
-    assert np.abs(np.diff(us, axis=0)).max() <= 0.3 + 1e-9
-
-
 def test_a_previewed_set_point_is_met_on_time():
     controller = qm.Controller(integrator(references="preview"))
     x, ys = np.zeros(2), []
@@ -59,13 +51,6 @@ def test_forecasts_are_fed_forward():
     assert np.allclose(controller.step([0.0], [0.0], known=[0.2]), [-0.2])
     ahead = controller.step([0.0], known=pd.DataFrame({"d": [0.2] * 2 + [1.0] * 9}))
     assert ahead[0] < -0.25
-
-
-def test_signals_go_in_and_out_by_name():
-    mpc = integrator(inputs=["valve"], outputs=["level"])
-    by_name, by_vector = qm.Controller(mpc), qm.Controller(mpc)
-    u = by_name.step({"level": 0.5}, {"level": 1.0})
-    assert u == {"valve": by_vector.step([0.5], [1.0])[0]}
 
 
 def test_a_series_is_by_name_in_any_order():
@@ -113,7 +98,6 @@ def test_a_reset_starts_where_the_plant_rests():
         lambda _: qm.Controller(integrator(learn=("H", "q"))).redesign(Q=2.0),
         "mpc: got an MPC that learns H, q, expected one whose theta is its design's. Change",
     ),
-    (lambda c: c.reset(y=[1e12]), r"y: got 1e\+12 of y1, expected at most 1e\+08 in size"),
     (lambda c: c.step({"T": 0.0}, [0.0]), r"y: got signals \['T'\], expected the signals \['y1'\]"),
     (lambda c: c.reset(u=[1.0, 2.0]), r"u: got shape \(1, 2\), expected 1 numbers"),
     (lambda c: qm.Controller(c.mpc, noise=0.0), "noise: got 0 of y1, expected a standard deviatio"),

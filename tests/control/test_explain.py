@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import torch_qpmpc as qm
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.control.state_space import read_model
 
 A, B = np.array([[0.9, 0.05], [0.0, 0.8]]), np.array([[0.5], [0.2]])
@@ -129,21 +129,17 @@ def test_faulty_steps_are_told_in_words():
     started.explain().plot()
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda c: c.reset(),
-        lambda c: c.redesign(Q=2.0),
-        lambda c: c.observe([2.0, 0.3], [0.5], known={"d": 1.0, "most": 2.0}),
-    ],
+NOTHING = "controller: got no step since the last change, expected a"
+
+
+@refused(
+    (lambda c: c.reset(), NOTHING),
+    (lambda c: c.redesign(Q=2.0), NOTHING),
+    (lambda c: c.observe([2.0, 0.3], [0.5], known={"d": 1.0, "most": 2.0}), NOTHING),
 )
 def test_without_a_step_there_is_nothing_to_explain(change):
-    made = stepped()
-    change(made)
-    with pytest.raises(
-        QPError, match=r"^controller: got no step since the last change, expected a"
-    ):
-        made.explain()
+    change(made := stepped())
+    made.explain()
 
 
 def test_hard_bounds_are_looked_for_without_a_plan_only(monkeypatch):

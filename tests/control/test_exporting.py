@@ -118,16 +118,6 @@ def test_an_output_is_missing_from_the_largest_plausible_one_on(exported):
         assert (twin.step(share * controller.max_plausible[0])[1] == 4) == missing
 
 
-def test_an_absurd_known_signal_leaves_the_estimates_alone(tmp_path):
-    controller = qm.Controller(learned())
-    twin = load(controller.export_c(tmp_path).files, controller)
-    rain, price = np.zeros((2, 5, 2))
-    rain[4, 0], price[4, 1] = 1e36, 1e36
-    assert twin.step([0.0], [1.0], rain)[1] == 3
-    assert twin.step([0.0], [1.0], price)[1] != 3  # it moves no state
-    assert twin.step([0.0], [1.0], 0 * rain)[1] == 0
-
-
 @pytest.mark.parametrize("y", [1e12, 1e16, 1e20])
 def test_a_certified_input_keeps_the_bounds_of_moves_where_rounding_is_large(absurd, y):
     twin = absurd

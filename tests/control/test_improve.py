@@ -49,7 +49,6 @@ def rng_levels() -> np.ndarray:
 
 @functools.cache
 def model():
-    """Return the log's model, on which the price and the limit do not act."""
     return qm.identify(logged(), order=1)
 
 
@@ -186,7 +185,8 @@ def test_a_theta_with_a_new_fault_is_not_kept(monkeypatch):
 def test_what_is_no_better_leaves_the_controller_as_it_was():
     controller = made("blocks")
     mpc = controller.mpc
-    report = controller.improve(logged(), updates=1, loops=2, steps=5, held_out=16, rate=1e-9)
+    few: Any = {"updates": 1, "loops": 2, "steps": 5, "held_out": 16, "members": 2}
+    report = controller.improve(logged(), rate=1e-9, **few)
     assert not report.kept
     assert controller.mpc is mpc
 

@@ -19,8 +19,6 @@ QUICK = {"r": [0.5], "spread": 0.5, "steps": 8, "transitions": 120}
 
 
 class Lag(gymnasium.Env):
-    """y+ = 0.9 y + 0.5 u + load + noise."""
-
     def __init__(self, load=0.1, noise=0.01, start=0.0):
         self.load, self.noise, self.start = load, noise, start
 
@@ -41,7 +39,6 @@ def made(model, **options):
 
 
 def logged(steps=600, dt=None):
-    """Return signals of the plant with random inputs."""
     env, rng = Lag(), np.random.default_rng(5)
     u, y = rng.uniform(-1, 1, (steps, 1)).repeat(3, 0)[:steps], [env.reset(seed=1)[0]]
     y += [env.step(x)[0] for x in u[:-1]]

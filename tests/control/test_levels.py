@@ -12,7 +12,6 @@ LEVELS = (0.0, 4.0, 8.0)
 
 
 def of(model=([[0.9]], [[0.1]]), **options) -> qm.LinearMPC:
-    """Return the MPC of a room with a heat pump that has two speeds and a load."""
     defaults = {
         "Q": {"T": 1.0},
         "u_levels": {"q": LEVELS},

@@ -48,7 +48,6 @@ def controller(linear: bool = False, horizon: int = 10, **options: Any) -> qm.Co
 
 
 def loop(own: qm.Controller, set_points: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return outputs and inputs with noise and a constant load of the inputs."""
     rng, x, states, inputs = np.random.default_rng(0), np.array(REST[0]), [], []
     own.reset(y=x, u=REST[1])
     for r in set_points:
@@ -165,7 +164,7 @@ def test_hard_bounds_have_a_plan_though_the_first_linearisations_have_none(
     own = qm.Controller(qm.LinearMPC((f, [0.0, 0.0], [0.0]), 20, **options))
     x = torch.tensor([angle, 0.0]).double()
     own.reset(y=x.numpy(), u=[0.0])
-    for k in range(3 if status else 40):
+    for k in range(2 if status else 30):
         with qm.SolveLog() as log:
             x = f(x, torch.from_numpy(own.step(x.numpy(), r=[1.1, 0.0])))
         assert own.status == status
@@ -212,7 +211,7 @@ def test_a_run_starts_with_the_resets_outputs_where_a_plant_rests_anywhere(u):
 
 @pytest.mark.parametrize("u", [None, [0.1, 2.0]])
 def test_a_run_starts_at_a_rest_of_the_plant_though_the_models_point_is_none(u):
-    run = tank().simulate(steps=60, r=[1.2, 0.5], u=u, load=[0.01, 0.1])
+    run = tank().simulate(steps=25, r=[1.2, 0.5], u=u, load=[0.01, 0.1])
     (X, S), (flow, feed) = run.y[0], run.u_last
     assert_allclose([X, 0.5 * S / (0.2 + S + S**2 / 2)], [0.4 * (feed - S), flow], atol=1e-6)
     assert S > 0
@@ -226,7 +225,7 @@ def test_a_set_point_above_what_a_saturating_valve_holds_is_tracked_as_near_as_i
     own = qm.Controller(qm.LinearMPC((f, [1.0], [0.55]), 20, **options), noise=0.01)
     x = torch.tensor([1.0]).double()
     own.reset(y=x.numpy(), u=[0.55])
-    for r in [0.3] * 10 + [5.0] * 20 + [1.0] * 20:
+    for r in [0.3] * 5 + [5.0] * 8 + [1.0] * 12:
         x = f(x, torch.from_numpy(own.step(x.numpy(), r=[r])))
         assert own.status == 0
     assert_allclose(x, 1.0, atol=0.02)
@@ -291,11 +290,11 @@ def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path):
     assert own.mpc.design.plant.noise is not None
     x, rng, off = np.array([1.0, 1.0]), np.random.default_rng(1), []
     own.reset(y=[1.0], u=[1.0])
-    for _ in range(50):
+    for _ in range(40):
         u = own.step(x[1:] + 0.01 * rng.normal(), r=[2.0])
         x = np.maximum(x + 0.4 * (np.array([u[0] - 0.1, x[0] ** 0.5]) - x**0.5), 0.0)
         off.append(x[1] - 2.0)
-    assert abs(np.mean(off[30:])) < 0.02
+    assert abs(np.mean(off[25:])) < 0.02
     own.save(tmp_path / "own.qpmpc")
     twin = qm.Controller.load(tmp_path / "own.qpmpc")
     for _ in range(3):
@@ -303,12 +302,6 @@ def test_what_a_log_teaches_is_controlled_and_saved(log, tmp_path):
     for each in (own, twin):
         each.reset(y=[1.0])
     assert_allclose(twin.mpc.design.plant.point, own.mpc.design.plant.point, rtol=1e-12)
-
-
-def test_a_loop_starts_at_the_models_point():
-    run = controller().simulate(steps=2, r=REST[0])
-    assert_allclose(run.u_last, REST[1])
-    assert_allclose(run.y, [REST[0]] * 3, atol=1e-6)
 
 
 def test_what_needs_matrices_refuses_functions(tmp_path, log):

@@ -21,7 +21,6 @@ OFFSET = 1e-6
 
 
 def settled(plant: Plant, step: Step) -> np.ndarray:
-    """Return the outputs where the closed loop of the plant settles."""
     x = np.zeros(len(plant.A))
     for k in range(STEPS):
         u = step(plant.C @ x + plant.bias, plant.r)

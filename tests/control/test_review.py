@@ -21,13 +21,11 @@ TWO_INPUTS = ([[0.9]], [[0.5, 0.4]])
 
 
 def controller(model, horizon=10, filtered=None, r=None, **options):
-    """Return the controller of a design, and its set-points."""
     design = {"Q": 1.0, "dR": 0.1, "u_bounds": (-1.0, 1.0), "y_bounds": (-4.0, 4.0), **options}
     return qm.Controller(qm.LinearMPC(model, horizon, **design), **(filtered or {})), r
 
 
 def made(model, *args, **options):
-    """Return the review of a design."""
     made, r = controller(model, *args, **options)
     return made.review(r)
 
@@ -157,7 +155,6 @@ def test_a_review_makes_the_tables_of_a_plan_and_its_target_once(monkeypatch):
 
 
 def noisy(L=0.02, S=1e-3, A=0.9):
-    """Return the lag with another noise."""
     return replace(NOISY, A=np.array([[A]]), noise=(np.array([[L]]), S * np.eye(1)))
 
 
@@ -188,7 +185,6 @@ def test_noise_that_drives_inputs_to_their_bounds_is_named_and_its_remedy_mends_
 
 
 def loop(model, **options):
-    """Return the loop of a design with noise and a load."""
     looped, r = controller(model, **options)
     noise = 0.01 * looped.mpc.design.y_bounds[1]
     r = 10 * noise if r is None else r

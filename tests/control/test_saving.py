@@ -18,7 +18,6 @@ FOLDER = Path(__file__).parent
 
 
 def inputs(controller: qm.Controller, steps: int = 20) -> np.ndarray:
-    """Return the inputs of a closed loop with noise, a load and a moving set-point."""
     rng, x, us = np.random.default_rng(1), controller.x, []
     for k in range(steps):
         y = C @ x + 0.01 * rng.normal(size=1)

@@ -22,7 +22,6 @@ C, D = np.array([[1.0, 0.0]]), np.array([[0.0]])
 
 
 def system(**changes):
-    """A system with the attributes of control.StateSpace."""
     return SimpleNamespace(**{"A": A, "B": B, "C": C, "D": D, "dt": 0, **changes})
 
 

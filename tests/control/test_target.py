@@ -12,7 +12,6 @@ from torch_qpmpc.export.tables import make_tables
 
 
 def drawn(seed: int) -> qm.LinearMPC:
-    """Return the MPC of a stable plant with more inputs than outputs."""
     rng = np.random.default_rng(seed)
     n, n_y = 4, int(rng.integers(1, 3))
     basis = np.linalg.qr(rng.normal(size=(n, n)))[0]

@@ -8,7 +8,6 @@ import pytest
 import torch_qpmpc as qm
 from tests.campaign.units import Units, drawn, judged
 from torch_qpmpc import QPError
-from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.export.tables import make_tables
 
 
@@ -50,30 +49,6 @@ def test_noise_costs_the_same_in_any_unit():
         weights = {"Q": 1 / unit**2, "dR": 0.1, "u_bounds": (-1.0, 1.0)}
         found.append(qm.Controller(qm.LinearMPC(model, 10, **weights)).review()["noise"].text)
     assert found[0] == found[1] == found[2]
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e3, 1e5])
-def test_an_input_in_watts_has_its_part_in_the_target(unit):
-    A, B = np.array([[0.95, 0.0], [0.02, 0.9]]), np.array([[0.05, 0.0], [-0.01, 1e-6 * unit]])
-    weights = {"Q": 1.0, "dR": [0.1, 0.1 * (1e-5 * unit) ** 2]}
-    bounds: Any = {"u_bounds": ([-3.0, -3e5 / unit], [3.0, 3e5 / unit])}
-    target = qm.LinearMPC((A, B), 20, **weights, **bounds).target([0.5, 0.7])
-    assert np.allclose(target.y, [0.5, 0.7])
-    assert np.allclose(target.u.numpy() * [1.0, unit], [0.5, 65000.0], rtol=1e-6)
-
-
-@pytest.mark.parametrize(("x", "u"), [(1e2, (1.0, 1e3)), (1e5, (1e-2, 1e5)), (1e-3, (1.0, 1e5))])
-@pytest.mark.parametrize("R", [0.0, 1.0])
-def test_the_terminal_weight_is_the_same_in_any_unit(x, u, R):
-    found = []
-    for x_unit, u_unit in ((1.0, np.ones(2)), (x, np.array(u))):
-        model = [[1.2]], np.array([[0.3, 0.2]]) * x_unit / u_unit
-        weights = {"Q": 1 / x_unit**2, "R": R / u_unit**2, "dR": [0.1, 0.05] / u_unit**2}
-        mpc = qm.LinearMPC(model, 5, **weights, u_bounds=(-u_unit, u_unit))
-        P, size = riccati(mpc.design), np.append(x_unit, u_unit)
-        found.append(None if P is None else P * np.outer(size, size))
-    assert (found[0] is None) == (found[1] is None) == (R == 0)
-    assert R == 0 or np.allclose(*found, rtol=1e-9)
 
 
 def test_a_remedy_names_a_weight_in_each_input_s_own_unit():
