@@ -165,7 +165,6 @@ CASES = {
 
 
 def run(name: str, seed: int) -> dict[str, Any]:
-    """Return the fields of a row."""
     case = CASES[name](seed)
     before, began = case.J(), time.process_time()
     report = case.improve(seed=seed)
@@ -186,7 +185,6 @@ def main(arguments: Iterable[str] | None = None) -> None:
 
 
 def shown(rows: Any) -> str:
-    """Format the medians and the worst seed of each case."""
     lines = []
     for name in CASES:
         own = rows[rows["case"] == name]

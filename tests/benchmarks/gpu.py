@@ -36,20 +36,14 @@ LARGE, OF_PEERS = 65_536, 16_384
 ROUNDS = 7
 
 
-def synchronise() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-
-
-def seconds(run: Callable[[], object], before: Callable[[], object] = lambda: None) -> float:
+def seconds(run: Callable[[], object]) -> float:
     """Return the median wall-clock time of ``run``, after two rounds to warm up."""
     times = []
     for _ in range(ROUNDS + 2):
-        before()
-        synchronise()
+        torch.cuda.synchronize()
         began = time.perf_counter()
         run()
-        synchronise()
+        torch.cuda.synchronize()
         times.append(time.perf_counter() - began)
     return sorted(times[2:])[ROUNDS // 2]
 
@@ -57,20 +51,19 @@ def seconds(run: Callable[[], object], before: Callable[[], object] = lambda: No
 # The curve over batches
 
 
-def curve(device: torch.device, batches: tuple[int, ...] = BATCHES) -> str:
+def curve() -> str:
     """Return the table of times a QP and of memory, by batch."""
-    mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
+    mpc = make_mpc(PAPER, dense=True, solver="torch").to(GPU)
     exact = make_mpc(PAPER, dense=True, solver="daqp")
     lines = []
-    for batch in batches:
+    for batch in BATCHES:
         data = transitions(PAPER.n_x, PAPER.n_u, batch)
-        s, a = data.s.to(device), data.a.to(device)
+        s, a = data.s.to(GPU), data.a.to(GPU)
         with torch.no_grad():
             error = relative_error(mpc.value(s).cpu(), exact.value(data.s)).max()
-            if device.type == "cuda":
-                torch.cuda.reset_peak_memory_stats()
+            torch.cuda.reset_peak_memory_stats()
             cold = seconds(lambda s=s: mpc.value(s))
-            memory = torch.cuda.max_memory_allocated() / 2**20 if device.type == "cuda" else 0
+            memory = torch.cuda.max_memory_allocated() / 2**20
 
         def gradient(value: Callable[[], Tensor]) -> float:
             def run() -> None:
@@ -114,10 +107,10 @@ def _active(first: int, count: int) -> Tensor:
     return mpc.solve(s).active
 
 
-def on_cores(cores: int, count: int = LARGE) -> list[float]:
-    """Return the seconds of ``count`` QPs by DAQP, cold and warm, in one process a core."""
+def on_cores(cores: int) -> list[float]:
+    """Return the seconds of `LARGE` QPs by DAQP, cold and warm, in one process a core."""
     context = multiprocessing.get_context("spawn")
-    share = count // cores
+    share = LARGE // cores
     parts = [(share, i * share) for i in range(cores)]
     with ProcessPoolExecutor(cores, mp_context=context) as pool:
         results = []
@@ -130,14 +123,14 @@ def on_cores(cores: int, count: int = LARGE) -> list[float]:
     return results
 
 
-def by_qpax(count: int = OF_PEERS) -> tuple[float, float] | None:
+def by_qpax() -> tuple[float, float] | None:
     """Return qpax's seconds, and its largest relative error of a value; None without it."""
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if find_spec("jax") is None or find_spec("qpax") is None:
         return None
     jax, jnp, qpax = map(import_module, ("jax", "jax.numpy", "qpax"))
     jax.config.update("jax_enable_x64", True)
-    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, count).s
+    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, OF_PEERS).s
     with torch.no_grad():
         full = FullSpace.of(mpc.quadratic_program(), s)
         G, h = full.one_sided()
@@ -154,11 +147,11 @@ def by_qpax(count: int = OF_PEERS) -> tuple[float, float] | None:
     return seconds(lambda: solve(*data).block_until_ready()), float(error)
 
 
-def by_moreau(count: int = OF_PEERS) -> tuple[float, float] | None:
+def by_moreau() -> tuple[float, float] | None:
     """Return the seconds of Moreau's interior point, and its largest relative error of a value."""
     if find_spec("moreau") is None:
         return None
-    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, count).s
+    mpc, s = make_mpc(PAPER, dense=True), transitions(PAPER.n_x, PAPER.n_u, OF_PEERS).s
     values = moreau(GPU.type, "ipm")
     with torch.no_grad():
         expected = mpc.value(s)
@@ -167,21 +160,18 @@ def by_moreau(count: int = OF_PEERS) -> tuple[float, float] | None:
         return seconds(lambda: values(qp, on_gpu)), float(error)
 
 
-def comparison(device: torch.device, count: int = LARGE) -> str:
+def comparison() -> str:
     """Return the table of all solvers at one batch, in microseconds a QP."""
-    mpc = make_mpc(PAPER, dense=True, solver="torch").to(device)
-    s = transitions(PAPER.n_x, PAPER.n_u, count).s.to(device)
+    mpc = make_mpc(PAPER, dense=True, solver="torch").to(GPU)
+    s = transitions(PAPER.n_x, PAPER.n_u, LARGE).s.to(GPU)
     with torch.no_grad():
         times = [seconds(lambda: mpc.solve(s))]
-    rows: list[tuple[str, int, list[float]]] = []
-    rows.append(("torch, GPU", count, times))
     cores = os.cpu_count() or 1
-    rows.append(("daqp, one core", count, on_cores(1, count)))
-    rows.append((f"daqp, {cores} cores", count, on_cores(cores, count)))
+    rows = [("torch, GPU", LARGE, times), ("daqp, one core", LARGE, on_cores(1))]
+    rows.append((f"daqp, {cores} cores", LARGE, on_cores(cores)))
     for name, of in {"qpax": by_qpax, "Moreau": by_moreau}.items():
-        if (peer := of(min(count, OF_PEERS))) is not None:
-            label = f"{name}, GPU (error {peer[1]:.0e})"
-            rows.append((label, min(count, OF_PEERS), [peer[0]]))
+        if (peer := of()) is not None:
+            rows.append((f"{name}, GPU (error {peer[1]:.0e})", OF_PEERS, [peer[0]]))
     lines = [
         [name, f"{batch:,}", *(significant(1e6 * x / batch) for x in each), *[""] * (2 - len(each))]
         for name, batch, each in rows
@@ -189,16 +179,16 @@ def comparison(device: torch.device, count: int = LARGE) -> str:
     return table(["", "batch", "cold", "warm"], lines)
 
 
-def report(device: torch.device) -> str:
-    card = torch.cuda.get_device_name() if device.type == "cuda" else "the CPU, for a trial"
+def report() -> str:
     return "\n\n".join(
         (
-            f"On one {card}, with torch {torch.__version__} and {os.cpu_count()} CPU cores.",
+            f"On one {torch.cuda.get_device_name()}, with torch {torch.__version__} and "
+            f"{os.cpu_count()} CPU cores.",
             "**By batch**, in microseconds per QP. Memory is the peak while V is computed; the "
             "error is the largest of a value, against DAQP:",
-            curve(device),
+            curve(),
             "**Beside other solvers**, in microseconds per QP:",
-            comparison(device),
+            comparison(),
         )
     )
 
@@ -209,7 +199,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if not torch.cuda.is_available():
         raise SystemExit("python -m tests.benchmarks.gpu: torch sees no CUDA device")
-    publish(report(GPU), "gpu", options.write)
+    publish(report(), "gpu", options.write)
 
 
 if __name__ == "__main__":

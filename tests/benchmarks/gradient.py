@@ -62,7 +62,6 @@ class Gradient(NamedTuple):
         return V, value
 
     def flat(self) -> Tensor:
-        """Return the gradient in all of theta as one vector."""
         return torch.cat([p.grad.flatten() for p in self.mpc.parameters() if p.grad is not None])
 
 
@@ -170,7 +169,6 @@ def measured(name: str, dense: bool, batch: int) -> Row:
 
 
 def gradients(rows: dict[str, dict[tuple[bool, int], Row]]) -> str:
-    """Format the table."""
     lines = []
     for name, mine in rows.items():
         cells = []

@@ -89,7 +89,6 @@ outside.PLANTS[DELAYED] = outside.Outside(
 
 
 def logged(env: Any, seed: int) -> Any:
-    """Return a log of episodes with random actions."""
     rng, rows, m = np.random.default_rng(seed), [], env.action_space.shape[0]
     while len(rows) < ACTIONS:
         episode = 0 if not rows else rows[-1][0] + 1
@@ -106,7 +105,6 @@ def logged(env: Any, seed: int) -> Any:
 
 
 def by_guide(name: str, seed: int) -> float:
-    """Return J of the controller of one log."""
     env = gymnasium.make("Delay-v0") if name == DELAYED else outside.controlgym(name.split()[-1])
     model = qm.identify(logged(env, seed), horizon=HORIZON)
     mpc = qm.LinearMPC(model, horizon=HORIZON, u_bounds=(-1.0, 1.0), **WEIGHTS[name])

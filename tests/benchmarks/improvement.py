@@ -62,7 +62,6 @@ CASES = {
 
 
 def configuration(case: Case, seed: int) -> Any:
-    """Compose the configuration of a run."""
     cfg = make_config(*COMMON, *case.overrides, f"seed={seed}")
     cfg.eval_interval = cfg.updates
     return cfg
@@ -92,7 +91,6 @@ def trained(case: Case, seed: int) -> tuple[Any, int, dict[str, Any]]:
 
 
 def run(case: str, seed: int) -> dict[str, Any]:
-    """Return the fields of a row."""
     cfg, logged, summary = trained(CASES[case], seed)
     before, each = experience(cfg)
     costs = {

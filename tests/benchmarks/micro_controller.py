@@ -84,7 +84,6 @@ class Masses(LinearSystem):
 
 
 def masses(seed: int) -> Masses:
-    """Draw a plant."""
     rng = np.random.default_rng(seed)
     m, k, d = (
         rng.uniform(low, high, n) for low, high, n in ((0.7, 1.4, 3), (0.7, 1.4, 4), (0.05, 0.2, 3))
@@ -112,7 +111,6 @@ def regulator(plant: Masses, weight: Tensor = WEIGHT) -> tuple[Tensor, Tensor]:
 def mpc(
     plant: Masses, N: int, weight: Tensor = WEIGHT, price: float = PRICE, **own: Any
 ) -> qm.QPMPC:
-    """Return MPC with the regulator's cost of x_N."""
     bound, slack = torch.full((8,), torch.inf).double(), torch.full((8,), price).double()
     bound[POSITIONS], bound[FORCES], slack[FORCES] = BOUND, FORCE, 1e3
     P, _ = regulator(plant, weight)
@@ -133,7 +131,6 @@ def mpc(
 
 
 def J(policy: Callable[[Tensor], Tensor], plant: Masses, seed: int, steps: int = 400) -> float:
-    """Return the mean cost of a step."""
     with torch.no_grad():
         return closed_loop(policy, plant, steps=steps, starts=LOOPS, seed=seed).costs.mean().item()
 
@@ -180,7 +177,6 @@ def expected_gain(z: np.ndarray, values: np.ndarray, tries: np.ndarray) -> np.nd
 
 
 def kernel(x: np.ndarray, y: np.ndarray, length: float) -> np.ndarray:
-    """Return Matern's kernel of smoothness 5/2."""
     r = math.sqrt(5) * np.linalg.norm(x[:, None] - y, axis=-1) / length
     return (1 + r + r**2 / 3) * np.exp(-r)
 
@@ -206,7 +202,6 @@ def network(plant: Masses, seed: int) -> Callable[[Tensor], Tensor]:
 
 
 def improved(plant: Masses, seed: int) -> qm.QPMPC:
-    """Return N = 3 with theta moved by `UPDATES` gradients."""
     policy = mpc(plant, 3, price=LOWER, structure="tied", learn=("H", "H_f", "lb", "ub", "w"))
     qm.improve(policy, plant, updates=UPDATES, loops=32, steps=STEPS, held_out=128, seed=seed)
     return policy
@@ -267,7 +262,6 @@ def measured(seeds: list[int], names: list[str]) -> tuple[dict[str, list[float]]
 
 
 def main() -> None:
-    """Print or write the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.micro_controller")
     parser.add_argument("--seeds", type=int, nargs="+", default=[*SEEDS])
     parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=[*DESIGNS])

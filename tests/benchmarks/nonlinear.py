@@ -116,7 +116,6 @@ class CrossEntropy:
 
 
 def on_plant(plant: Plant, p: Tensor, plans: Tensor) -> Tensor:
-    """Return the costs of plans on the true plant."""
     s, u, J = tuple(x[:, None] for x in plant.state(p.numpy().T)), plans.numpy()[..., 0], 0.0
     for k in range(u.shape[-1]):
         s, cost = plant.function(s, u[..., k])
@@ -125,7 +124,6 @@ def on_plant(plant: Plant, p: Tensor, plans: Tensor) -> Tensor:
 
 
 def on_model(mpc: Any, p: Tensor, plans: Tensor) -> Tensor:
-    """Return the costs of plans on a learned model."""
     with torch.no_grad():
         return mpc.sequential.simulated(p[:, None], plans)[1]
 
@@ -158,7 +156,6 @@ class Ipopt:
         self.rng = np.random.default_rng(0)
 
     def solved(self, s: tuple[Any, ...], u: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the cost and the actions from those of a plan."""
         w, at = [], s
         for a in u:
             at, _ = self.plant.function(at, a)
@@ -264,7 +261,6 @@ class Rows(NamedTuple):
         print(*row.values(), flush=True)
 
     def has(self, design: str, transitions: int | None = None) -> bool:
-        """Is there a row?"""
         rows: Any = pd.read_csv(self.path) if self.path.exists() else pd.DataFrame(columns=FIELDS)
         own = (rows["plant"] == self.plant) & (rows["seed"] == self.seed)
         own &= rows["design"] == design
@@ -272,7 +268,6 @@ class Rows(NamedTuple):
 
 
 def from_log(rows: Rows) -> None:
-    """Add nonlinear MPC of a log, and CEM on its model."""
     torch.manual_seed(rows.seed)
     log = collect_log(rows.cfg, rows.physics)
     start = candidates(rows.cfg, rows.physics, log)[NONLINEAR]
@@ -295,7 +290,6 @@ def from_log(rows: Rows) -> None:
 
 
 def true_model(rows: Rows) -> None:
-    """Add the rivals that know the plant."""
     plant = PLANTS[rows.plant]
     make = partial(CrossEntropy, partial(on_plant, plant), rows.physics, AHEAD, MANY, rows.seed)
     rows.add(CEM_TRUE, 0, make, rows.physics, steps=MANY[0] * MANY[1] * AHEAD)
@@ -303,7 +297,6 @@ def true_model(rows: Rows) -> None:
 
 
 def optimum(rows: Rows) -> None:
-    """Add the optimum, zero action and the start from a log."""
     known = CONVERSE[rows.plant]
 
     def policy(p: Tensor) -> Tensor:

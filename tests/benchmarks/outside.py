@@ -110,7 +110,6 @@ PCGYM: dict[str, dict[str, Any]] = {
 
 
 def pcgym_parameters(model: str) -> dict[str, Any]:
-    """Return the arguments of a pcgym environment."""
     common = {"normalise_a": True, "normalise_o": True, "noise": True, "noise_percentage": 0.001}
     own = PCGYM[model]
     common |= {"r_scale": dict.fromkeys(own["SP"], 1e3), "integration_method": "casadi"}
@@ -181,7 +180,6 @@ class ControlGym(gymnasium.Wrapper):
 
 
 def controlgym(plant: str) -> Any:
-    """Make a controlgym environment."""
     with warnings.catch_warnings():  # the package turns all warnings into errors
         package, _ = import_module("controlgym"), import_module("controlgym.controllers")
     settings = {"n_steps": 100, "action_limit": 1.0} | SETTINGS.get(plant, {})
@@ -318,7 +316,6 @@ PLANTS = {
 
 
 def configuration(name: str, seed: int, *overrides: str) -> Any:
-    """Compose the configuration of a plant's documented command."""
     plant = PLANTS[name]
     own = ("task=gymnasium", f"task.id={plant.id}", "start=data", f"seed={seed}")
     return run_code(compose_config(*own, "figures=false", *plant.overrides, *overrides))
@@ -335,7 +332,6 @@ def reference(plant: Outside) -> float:
 
 
 def run(name: str, seed: int) -> dict[str, Any]:
-    """Start once; return the fields of a row."""
     cfg = configuration(name, seed)
     physics: Any = make_physics(cfg)
     began = time.process_time()
@@ -344,9 +340,7 @@ def run(name: str, seed: int) -> dict[str, Any]:
         start = make_start(cfg, physics, folder)
         assert start is not None
     seconds = time.process_time() - began
-    policies = {"zero": zero_action(physics), "random": _random(physics, seed)}
-    costs = {key: _costs(cfg, physics, policy) for key, policy in policies.items()}
-    plant = physics.observed(start.observer)
+    plant, costs = physics.observed(start.observer), {"zero": _costs(cfg, physics)}
     costs["start"] = _costs(cfg, plant, warm_policy(make_mpc(cfg, plant, start)))
     excess = costs["start"] - costs["zero"]
     row = {"plant": name, "seed": seed, **{key: x.mean().item() for key, x in costs.items()}}
@@ -358,20 +352,9 @@ def run(name: str, seed: int) -> dict[str, Any]:
     return row | {"seconds": round(seconds, 1)}
 
 
-def _costs(cfg: Config, physics: AnyPlant, policy: Any) -> torch.Tensor:
-    """Return the costs of the episodes of an evaluation."""
-    return evaluate(cfg, policy, physics, EVAL_SEED).costs.sum(0)
-
-
-def _random(physics: Any, seed: int) -> Callable[[torch.Tensor], torch.Tensor]:
-    rng = torch.Generator().manual_seed(seed)
-    low, high = physics.lb_a, physics.ub_a
-
-    def policy(s: torch.Tensor) -> torch.Tensor:
-        unit = torch.rand((len(s), len(low)), generator=rng, dtype=torch.float64)
-        return low + unit * (high - low)
-
-    return policy
+def _costs(cfg: Config, physics: AnyPlant, policy: Any = None) -> torch.Tensor:
+    """Return the costs of the episodes of an evaluation, by default with zero action."""
+    return evaluate(cfg, policy or zero_action(physics), physics, EVAL_SEED).costs.sum(0)
 
 
 def outcomes(rows: Any) -> str:

@@ -14,7 +14,6 @@ from torch_qpmpc.study.runs import collect
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write the tables, and NAME.png beside the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path, metavar="RUNS_FOLDER", help="runs at any depth")
     parser.add_argument("--page", type=Path, default=DOCS / "results/paper.md")

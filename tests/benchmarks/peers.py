@@ -20,7 +20,6 @@ CURVATURE = 1e-8
 
 
 def proxsuite() -> Values:
-    """Make ProxSuite's own torch layer, with its default settings."""
     layer = import_module("proxsuite.torch.qplayer").QPFunction()
 
     def values(qp: QuadraticProgram, fixed: Tensor) -> Tensor:

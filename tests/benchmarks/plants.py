@@ -180,17 +180,14 @@ class Known(NamedTuple):
         return np.linalg.solve(_root(H), y)
 
     def optimum(self, x: np.ndarray) -> np.ndarray:
-        """Return the optimal action."""
         G = self.G(x)
         curvature = self.R * np.eye(G.shape[1]) + self.gamma * G.T @ self.P @ G
         return -self.gamma * np.linalg.solve(curvature, G.T @ self.P @ self.f(x))
 
     def cost(self, x: np.ndarray, u: np.ndarray) -> float:
-        """Return the stage cost."""
         return float(self.share * x @ self.P @ x + self.R * u @ u)
 
     def V(self, x: np.ndarray) -> float:
-        """Return the optimal discounted cost."""
         constant = self.gamma / (1 - self.gamma) * self.noise**2 @ self.P.diagonal()
         return float(x @ self.P @ x + constant)
 
@@ -244,8 +241,6 @@ CONVERSE = {
 
 
 class Converse(gymnasium.Env):
-    """A plant of known optimum."""
-
     def __init__(self, name: str) -> None:
         self.plant = CONVERSE[name]
         n, m = self.plant.G(self.plant.starts).shape

@@ -123,13 +123,12 @@ def compared(y: np.ndarray, u: np.ndarray, cut: int) -> tuple[int, float, int, f
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.public_logs")
     parser.add_argument("folder", type=Path, help="where the logs are")
-    parser.add_argument("--only", nargs="*", help="names of logs")
     parser.add_argument("--write", action="store_true", help="write the table into the docs")
     options, lines, ratios = parser.parse_args(), [], []
     warnings.simplefilter("ignore")
     for name, source in LOGS.items():
         path = options.folder / source.file
-        if not path.exists() or (options.only and name not in options.only):
+        if not path.exists():
             continue
         y, u = read(path, source)
         start = time.process_time()

@@ -366,8 +366,7 @@ KEPT = {"kept, dearer, most": "improve", "the same, H": "improve, H"}
 IMPROVE: Any = {"updates": 60, "steps": STEPS}
 
 
-def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dict[str, Any]]:
-    """Yield the fields of each design's row."""
+def run(name: str, size: int, seed: int) -> Iterator[dict[str, Any]]:
     plant = PLANTS[name]
     found = qm.identify(collect(plant, size, seed), HORIZON)
     known = regulator(plant, found)
@@ -375,7 +374,7 @@ def run(name: str, size: int, seed: int, designs: Iterable[str]) -> Iterator[dic
     def price(p: Tensor, u: Tensor) -> Tensor:
         return plant.price(p, u)
 
-    for design in designs:
+    for design in DESIGNS:
         mpc, model, kept = designed(plant, found), found.model, None
         policy, began = mpc.policy, time.process_time()
         if design == "Riccati":
@@ -450,17 +449,15 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.rivals")
     parser.add_argument("--plants", nargs="+", choices=PLANTS, default=[*PLANTS])
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
-    parser.add_argument("--designs", nargs="+", choices=DESIGNS, default=DESIGNS)
     options = options_of(parser, arguments, SEEDS, RESULTS, PAGE)
     torch.set_num_threads(1)
     rows: Any = pd.read_csv(options.results) if options.results.exists() else pd.DataFrame()
     for seed, plant, size in product(options.seeds, options.plants, options.sizes):
-        key = dict(zip(("plant", "transitions", "seed"), (plant, size, seed), strict=True))
-        done = rows[(rows[[*key]] == [*key.values()]).all(axis=1)]["design"] if len(rows) else ()
-        if designs := [design for design in options.designs if design not in {*done}]:
-            rows = pd.concat([rows, pd.DataFrame([*run(plant, size, seed, designs)])])
+        key = [plant, size, seed]
+        if not len(rows) or not (rows[["plant", "transitions", "seed"]] == key).all(axis=1).any():
+            rows = pd.concat([rows, pd.DataFrame([*run(plant, size, seed)])])
             rows.to_csv(options.results, index=False, float_format="%.6g")
-            print(rows.tail(len(designs)).to_string(header=False, index=False), flush=True)
+            print(rows.tail(len(DESIGNS)).to_string(header=False, index=False), flush=True)
     write_section(options.page, shown(rows), "rivals")
 
 

@@ -28,7 +28,6 @@ Policy = Callable[[np.ndarray], Any]
 
 
 def ours() -> Policy:
-    """Return this package's policy."""
     end = (np.eye(2), np.zeros(2), np.zeros(2))
     mpc = qm.QPMPC.from_model(
         A,
@@ -49,7 +48,6 @@ def ours() -> Policy:
 
 
 def do_mpc() -> Policy:
-    """Return do-mpc's policy, with CasADi and IPOPT."""
     import casadi  # pyright: ignore[reportMissingImports]
     import do_mpc  # pyright: ignore[reportMissingImports]
 
@@ -72,7 +70,6 @@ def do_mpc() -> Policy:
 
 
 def gekko() -> Policy:
-    """Return GEKKO's policy, with APOPT on this machine."""
     from gekko import GEKKO  # pyright: ignore[reportMissingImports]
 
     m = GEKKO(remote=False)
@@ -100,7 +97,6 @@ def gekko() -> Policy:
 
 
 def ampyc() -> Policy:
-    """Return ampyc's policy, with CVXPY."""
     from ampyc.controllers import MPC  # pyright: ignore[reportMissingImports]
     from ampyc.noise import ZeroNoise  # pyright: ignore[reportMissingImports]
     from ampyc.systems import LinearSystem  # pyright: ignore[reportMissingImports]
@@ -134,7 +130,6 @@ class Loop:
         self.times: list[float] = []
 
     def step(self) -> None:
-        """Take a step."""
         began = time.perf_counter()
         u = np.ravel(self._policy(self._x))
         self.times.append(time.perf_counter() - began)

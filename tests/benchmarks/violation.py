@@ -37,7 +37,6 @@ def noise(kind: str, rng: np.random.Generator, steps: int) -> np.ndarray:
 
 
 def identified(kind: str, seed: int, steps: int = 600) -> Any:
-    """Return the model of a log of the tank."""
     rng = np.random.default_rng([seed, 1])
     w, v = noise(kind, rng, steps), 0.02 * rng.normal(size=steps)
     q, x, T = rng.uniform(0, 10, steps // 10).repeat(10), np.array([5.0, 5.0]), np.zeros(steps)
@@ -96,7 +95,6 @@ def rates(seeds: int, steps: int) -> str:
 
 
 def main() -> None:
-    """Print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--steps", type=int, default=300)
