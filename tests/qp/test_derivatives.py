@@ -281,7 +281,6 @@ BESIDE = torch.cat((ROW, torch.eye(5, dtype=torch.float64)[2:]))
 
 
 def equal(w: float, shift: float) -> Family:
-    """Return a row with equal bounds beside others, with a multiplier or without."""
     bounds = [0.0, -1.0, -1.0, -1.0], [0.0, 1.0, 1.0, 1.0]
     return family(BESIDE, *bounds, [w, INF, 5.0, INF], [shift])
 
@@ -294,7 +293,6 @@ def opposite(w: float, scale: float) -> Family:
 
 
 def pinched() -> Family:
-    """Return a'z >= 0, d'z >= 0 and (a + 2 d)'z <= 0, which leave a'z = d'z = 0."""
     rows, moves = torch.cat((PAIR, vector(1.0, 2.0)[None] @ PAIR)), vector(1.0, 1.0, 3.0)
     return family(rows, [0.0, 0.0, -INF], [INF, INF, 0.0], [INF] * 3, moves=moves)
 

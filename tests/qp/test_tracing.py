@@ -71,8 +71,6 @@ def test_a_transform_of_torch_func_hides(transform):
 
 
 class Doubled(torch.autograd.Function):
-    """Its backward records `tracing.is_hidden`."""
-
     seen: Seen
 
     @staticmethod

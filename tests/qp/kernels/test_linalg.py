@@ -77,22 +77,7 @@ def test_more_than_one_thread_would_take_is_multiplied_in_parts():
     np.testing.assert_allclose(found, vectors @ matrix[0].T, atol=1e-11)
 
 
-def test_spans_hold_all_nonzero_entries_of_any_matrix():
-    matrices = np.zeros((2, 5, 6))
-    matrices[0, 0, 2], matrices[0, 1, [0, 5]], matrices[0, 3, 3:5] = 1e-300, -1.0, np.nan
-    matrices[1, 0, 1], matrices[1, 4, 5] = np.inf, 1.0
-    expected = [[1, 3], [0, 6], [0, 0], [3, 5], [5, 6]]
-    np.testing.assert_array_equal(linalg.row_spans(matrices), expected)
-
-
 # For each theta
-
-
-def test_zeros_of_a_left_matrix_are_skipped():
-    left = RNG.normal(size=(2, 7, 5)) * (RNG.random((2, 7, 5)) < 0.2)
-    right = np.tril(RNG.normal(size=(1, 5, 3)))
-    found = linalg.sparse_products(left, right, *map(linalg.row_spans, (left, right)))
-    np.testing.assert_allclose(found, left @ right, rtol=1e-12)
 
 
 @pytest.mark.parametrize("threshold", [0.3, 0.0])
@@ -112,19 +97,6 @@ def test_a_band_is_eliminated(width, threshold):
     chi = linalg.multipliers(factors, pivots, spans, group, left)
     left += np.einsum("bij,bi->bj", C[group], chi)
     np.testing.assert_allclose(np.take_along_axis(left, pivots[group], 1), 0, atol=atol)
-
-
-def test_a_dependent_row_is_left_out():
-    C = np.concatenate((C := RNG.normal(size=(1, 2, 5)), C[:, :1]), 1)
-    *_, factors, pivots, regular = linalg.eliminate(C, 1, 1e-10, 0.3)
-    assert not regular
-    spans, z = linalg.row_spans(factors), RNG.normal(size=(1, 5))
-    found = linalg.particular(factors, pivots, spans, np.zeros(1, np.int64), z @ C[0].T, 5)
-    np.testing.assert_allclose(found @ C[0].T, z @ C[0].T)
-    left = RNG.normal(size=(1, 3)) @ C[0]
-    chi = linalg.multipliers(factors, pivots, spans, np.zeros(1, np.int64), left)
-    assert chi[0, 2] == 0
-    np.testing.assert_allclose(left, -chi @ C[0])
 
 
 class Terminal(io.StringIO):

@@ -15,14 +15,13 @@ from tests.problems import (
     programs_of,
     random_mpc,
     random_states,
-    soft_qps,
     within,
 )
 from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.kernels.sample import CLOSE
 from torch_qpmpc.qp.pipeline import batch
 from torch_qpmpc.qp.pipeline.batch import Programs
-from torch_qpmpc.qp.solvers import BackendSolution, daqp
+from torch_qpmpc.qp.solvers import daqp
 
 BATCH = 6
 SPOILERS = {
@@ -107,18 +106,6 @@ def test_qps_of_a_batch_are_certified_as_each_alone(name, matrices):
         lost = torch.stack([x.isnan().any(-1) for x in claim.values()]).any(0)
         lost |= claim["z"].isinf().any(-1)
         assert residual[lost].isinf().all()
-
-
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-def test_a_candidate_is_completed_to_the_full_solution(matrices):
-    for seed in range(4):
-        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
-        candidate = BackendSolution._make(x.numpy() for x in soft_qps(known)[1])
-        answer = programs_of(known).recover(candidate)
-        assert (answer.status == 0).all()
-        for name in ("value", "z", "lam", "chi", "xi"):
-            assert_close(torch.from_numpy(getattr(answer, name)), getattr(known, name))
-        assert (np.sign(answer.active) == known.lam.sign().numpy()).all()
 
 
 def test_many_qps_are_completed_and_recalled_in_threads_as_in_one(monkeypatch):

@@ -1,26 +1,9 @@
-import numpy as np
 import pytest
 import torch
-from torch.testing import assert_close
 
-from tests.problems import known_qp, normal
-from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from tests.problems import known_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.program import EVENT_SHAPES
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_an_asymmetric_hessian_counts_by_its_symmetric_part(dtype):
-    known = known_qp(0)
-    H = (known.qp.H + normal(12, 12).triu(1)).to(dtype)
-    programs, _ = Programs.of(H, *known.qp.tensors()[1:], known.fixed)
-    assert_close(to_tensor(programs.theta.H[0]), (H.double() + H.double().mT) / 2)
-
-
-def test_taken_programs_of_one_theta_share_its_preparation():
-    known = known_qp(0)
-    programs, _ = Programs.of(*known.qp.tensors(), normal(5, 2))
-    assert programs.take(np.array([3, 0])).prepared is programs.prepared
 
 
 @pytest.mark.parametrize("matrices", [(), (4,)])

@@ -68,7 +68,6 @@ def consistent(known: KnownQP, z: Tensor, lam: Tensor, **bounds: Tensor) -> Cert
 
 
 def where(known: KnownQP, kinds: tuple[str, ...], *, hard: bool) -> Tensor:
-    """Find the rows of these kinds by their multipliers, slacks and bounds."""
     qp, y = known.qp, known.z @ known.qp.G.mT
     is_kind = {
         "inside": (known.lam == 0) & qp.lb.isfinite() & qp.ub.isfinite(),
@@ -198,7 +197,6 @@ def test_the_error_of_the_value_is_bounded(parts, off, matrices):
 
 
 def largest_term(known: KnownQP, z: Tensor) -> Tensor:
-    """Compute the largest of the cost's terms at z, and of their sum, ``(B,)``."""
     H, q, _, _, _, G, lb, ub, w = known.qp.tensors()
     outside = (times(G, z) - times(G, z).clamp(lb, ub)).abs()
     terms = torch.stack(

@@ -16,7 +16,6 @@ from torch_qpmpc.qp.pipeline.condensing import (
     condense,
     dual,
     eliminate,
-    inverse_factors,
     sizes,
 )
 from torch_qpmpc.qp.solve import solve
@@ -42,7 +41,6 @@ MIXED = torch.stack((torch.cat((INDEPENDENT, normal(3, 8, seed=5))), REPEATED))
 
 
 def theta_of(H: Tensor, C: Tensor, G: Tensor) -> Theta:
-    """Make theta of these matrices, with vectors that condensing does not use."""
     none = np.zeros((1, 0))
     return Theta(H.numpy(), C.numpy(), G.numpy(), *[none] * 6)
 
@@ -107,38 +105,6 @@ def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
     searched = dual(H, G, 1e-8)  # not definite up to rounding
     assert searched.shift == pytest.approx(1e4 * SHIFT)
     assert dual(H, G, 1e-6).shift == 0
-
-
-def matrix_with(eigenvalues: list[float]) -> np.ndarray:
-    basis = np.linalg.qr(normal(len(eigenvalues), len(eigenvalues)).numpy())[0]
-    return (basis * eigenvalues) @ basis.T
-
-
-@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
-def test_a_definite_matrix_gets_the_inverse_of_its_cholesky_factor(size):
-    H = size * np.stack([matrix_with([1.0, 2.0, 5.0, 1e-3]), matrix_with([3.0] * 4)])
-    inverses, shifts = inverse_factors(H)
-    assert (shifts == 0).all()
-    np.testing.assert_allclose(
-        inverses, np.linalg.inv(np.linalg.cholesky(H)), rtol=1e-9, atol=1e-9 * size**-0.5
-    )
-
-
-def test_a_singular_matrix_is_shifted_by_a_part_of_its_largest_diagonal_entry():
-    H = matrix_with([1.0, 2.0, 0.0])[None]
-    inverses, shifts = inverse_factors(H)
-    assert shifts == pytest.approx(SHIFT * H.diagonal(axis1=1, axis2=2).max())
-    whole = inverses[0].T @ inverses[0] @ (H[0] + shifts * np.eye(3))
-    np.testing.assert_allclose(whole, np.eye(3), atol=1e-5)
-
-
-def test_zeros_are_shifted_and_neither_an_indefinite_matrix_nor_nan_has_a_factor():
-    H = np.stack([matrix_with([1.0, -1.0]), np.full((2, 2), np.nan), np.zeros((2, 2)), np.eye(2)])
-    inverses, shifts = inverse_factors(H)
-    assert np.isposinf(inverses[:2]).all()
-    assert np.isfinite(inverses[2]).all()
-    assert shifts[2] > 0 == shifts[3]
-    np.testing.assert_allclose(inverses[3], np.eye(2))
 
 
 @pytest.mark.parametrize(("cosine", "apart"), [(0.0, True), (0.4, True), (0.6, False)])

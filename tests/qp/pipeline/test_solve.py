@@ -39,8 +39,6 @@ BATCH = 6
 
 
 def doctored(change: Callable[[BackendSolution], BackendSolution]) -> Backend:
-    """Make a backend that changes its solution afterwards."""
-
     def solve(qps: SoftQPs) -> BackendSolution:
         return change(daqp.solve(qps))
 
@@ -64,7 +62,6 @@ INACCURACIES = {
 
 @pytest.fixture
 def liar(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> str:
-    """Register a backend that returns the test's wrong solution."""
     monkeypatch.setitem(BACKENDS, "liar", doctored(LIES[request.param]))
     return "liar"
 
@@ -318,7 +315,6 @@ def test_unsolved_qps_are_not_converged(recwarn):
 
 
 def spoil(known: KnownQP, index: int) -> KnownQP:
-    """Put NaN into one element of a batch."""
     q = known.qp.q.clone()
     q[index] = torch.nan
     return replace(known, qp=replace(known.qp, q=q, check_values=False))

@@ -18,17 +18,6 @@ def true_set(seed: int, matrices: tuple[int, ...] = ()):
     return programs_of(known), known, solution.active.numpy()
 
 
-@pytest.mark.parametrize("matrices", [(), (BATCH,)])
-@pytest.mark.parametrize("seed", range(3))
-def test_the_right_active_set_is_exact_at_once(seed, matrices):
-    p, exact, active = true_set(seed, matrices)
-    answer = p.recalled(active)
-    assert (answer.status == 0).all()
-    np.testing.assert_allclose(answer.z, exact.z, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(answer.lam, exact.lam, rtol=0, atol=1e-10)
-    assert (answer.iterations == 1).all()
-
-
 def test_codes_describe_each_rows_state():
     known = known_qp(4, batch=(BATCH,))
     active = solve_qp(known.qp, known.fixed, solver="torch").active

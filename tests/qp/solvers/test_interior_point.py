@@ -103,7 +103,6 @@ def test_multipliers_of_inactive_rows_are_zero():
 
 
 def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
-    """Return the relative KKT residual, ``(B,)``."""
     (v, lam, _), hard = answer, qps.w.isinf()
     Hv, y = torch.einsum("bde,be->bd", qps.H[qps.group], v), times(qps.G[qps.group], v)
     forces = torch.stack((Hv, qps.g, torch.einsum("brd,br->bd", qps.G[qps.group], lam)))
@@ -171,7 +170,6 @@ def test_an_empty_batch(matrices):
 
 
 def three(first: float, second: float) -> np.ndarray:
-    """Return the same two numbers for three QPs."""
     return np.tile([float(first), float(second)], (3, 1))
 
 
