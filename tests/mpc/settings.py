@@ -15,7 +15,7 @@ B = torch.tensor([[0.0], [0.3]]).double()
 W = torch.tensor([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]]).double()
 
 # A preview of a price and a reference
-N, N_X, N_U, N_D, GAMMA = 3, 2, 1, 2, 0.9
+N, N_X, N_U, N_D, GAMMA = 3, 2, 1, 2, 0.8
 n = N_X + N_U
 N_P = (N + 1) * N_D + N_X
 PRICE, REFERENCE, U = 0, 1, N_D + N_X  # entries of (d_k, x_k, u_k)
@@ -34,7 +34,6 @@ LAST_ROWS = ([[0.0, 0.5, 1.0, 0.0]], [-0.4], [0.4])
 
 
 def shifted(mpc: QPMPC, free: float, seed: int) -> QPMPC:
-    """Shift the learned entries by up to ``free``."""
     with torch.no_grad():
         for i, parameter in enumerate(mpc.parameters()):
             parameter += free * normal(*parameter.shape, seed=100 * seed + i).tanh()
@@ -43,7 +42,6 @@ def shifted(mpc: QPMPC, free: float, seed: int) -> QPMPC:
 
 
 def linear(seed: int = 0, *, free: float = 0.05, horizon: int = 4, **options: Any) -> QPMPC:
-    """Make a linear MPC scheme."""
     box = {"state_bounds": ([-1.0, -1.0], [1.0, 1.0]), "action_bounds": ([-0.5], [0.5])}
     parts = [part for part in EVERYTHING if part != "G" or "constraints" in options]
     settings = {**box, "stage_weight": W, "solver": "daqp", "hessian": "block", "learn": parts}
@@ -52,7 +50,6 @@ def linear(seed: int = 0, *, free: float = 0.05, horizon: int = 4, **options: An
 
 
 def previewed(seed: int = 0, *, free: float = 0.05, **options: Any) -> QPMPC:
-    """Make a QP with n_d=2."""
     settings: dict[str, Any] = {
         "E": E,
         "gamma": GAMMA,
@@ -113,20 +110,17 @@ SETTINGS = {
 
 
 def made(name: str, seed: int = 0, **changes: Any) -> QPMPC:
-    """Make the QPMPC of a row of the table."""
     make, options = SETTINGS[name]
     return make(seed, **options, **changes)
 
 
 def inputs(mpc: QPMPC, count: int = 6) -> tuple[Tensor, Tensor]:
-    """Draw p and actions, within the hard bounds of u_0."""
     if mpc.n_p == mpc.n_x:
         return random_states(count), random_states(count, 1, size=0.3)
     return normal(count, N_P, seed=5), 0.45 * normal(count, 1, seed=6).tanh()
 
 
 def stepped(mpc: QPMPC, rate: float = 1e-3) -> QPMPC:
-    """Take one training step on the sum of some values."""
     optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
     mpc(inputs(mpc, 4)[0]).sum().backward()
     optimizer.step()

@@ -51,7 +51,6 @@ def targets(mpc: QPMPC) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def moves(mpc: QPMPC, C: Tensor, mask: Tensor) -> None:
-    """Assert that C has changed where the mask is true, and nowhere else."""
     moved = mpc.C.detach() != C
     assert not moved[~mask].any()
     assert moved[mask].float().mean() > 0.5

@@ -17,7 +17,6 @@ N = 8
 
 
 def drawn(seed: int, horizon: int = N, most: int = 70_000) -> tuple[qm.QPMPC, torch.Tensor]:
-    """Return a random design with levels, minimum times and start costs, and a state."""
     rng = np.random.default_rng(seed)
     while True:
         n_x, m = int(rng.integers(1, 4)), int(rng.integers(1, 4))

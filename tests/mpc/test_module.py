@@ -478,7 +478,6 @@ def test_an_optimiser_copied_with_its_qp_moves_the_copy(copied, learn):
 
 
 def program(H: Tensor, n_known: int) -> QuadraticProgram:
-    """Make a QP in two variables without constraints."""
     return QuadraticProgram(H, torch.zeros(2).double(), n_known=n_known)
 
 

@@ -127,8 +127,6 @@ def test_large_parts_that_are_not_learned_are_compared_by_version():
 
 
 class Acting(nn.Module):
-    """A policy for a functional call."""
-
     def __init__(self, mpc: QPMPC) -> None:
         super().__init__()
         self.mpc = mpc

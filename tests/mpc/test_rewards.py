@@ -16,7 +16,6 @@ Q_LINEAR = torch.tensor([1.0, -2.0, 0.5]).double()
 
 
 def log(noise: float = 0.0) -> TensorDict:
-    """Return steps between independent observations."""
     draw = torch.Generator().manual_seed(0)
     y, following, u, e = (
         torch.randn(1, 300, n, generator=draw, dtype=torch.float64) for n in (2, 2, 1, 1)

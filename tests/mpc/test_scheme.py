@@ -1,9 +1,8 @@
 """A scheme describes a QPMPC: the short ways make one, and copies and identities follow from it."""
 
 import copy
-import io
 import pickle
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,7 +11,6 @@ import torch
 from tests.problems import MIXED
 from tests.refused import refused
 from torch_qpmpc import QPMPC, Bounds, Cost, Layout, Model, Scheme
-from torch_qpmpc.mpc.state import identity
 
 A, B = torch.tensor([[1.0, 0.1], [0.0, 0.9]]).double(), torch.tensor([[0.0], [0.1]]).double()
 W = torch.diag(torch.tensor([1.0, 0.5, 0.1])).double()
@@ -54,30 +52,6 @@ def test_copies_have_the_same_fields_and_theta(copied):
     assert (twin.layout, twin.gamma) == (scheme.layout, scheme.gamma)
     assert all(torch.equal(twin.theta[name], x) for name, x in scheme.theta.items())
     assert not copied(Scheme(Layout(2, 1, 3, n_d=1))).is_complete
-
-
-def test_the_arguments_in_a_file_make_the_same():
-    mask = torch.arange(8 * 14).reshape(8, 14) % 3 == 0
-    mpc, file = QPMPC(make(), learn={"C": mask, "H": True}, step="projection"), io.BytesIO()
-    torch.save(mpc.arguments, file)
-    file.seek(0)
-    same(QPMPC.of(**torch.load(file, weights_only=True)), mpc)
-
-
-def test_a_step_of_theta_leaves_the_scheme():
-    scheme = make()
-    before = {name: x.clone() for name, x in scheme.theta.items()}
-    mpc = QPMPC(scheme, learn=["H", "C", "b", "w"])
-    with torch.no_grad():
-        for x in (*mpc.parameters(), *mpc.buffers()):
-            x.zero_()
-    assert all(torch.equal(scheme.theta[name], x) for name, x in before.items())
-    mpc.reset_parameters()
-    same(mpc, QPMPC(scheme, learn=["H", "C", "b", "w"]))
-
-
-def test_the_identity_has_the_sizes():
-    assert set(asdict(make().layout)) <= identity(QPMPC(make())).keys()
 
 
 @refused(
