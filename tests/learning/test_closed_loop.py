@@ -79,8 +79,6 @@ def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
 
 
 class Pendulum:
-    """A plant with a sine that no linear policy knows."""
-
     def starts(self, rng: torch.Generator, count: int) -> torch.Tensor:
         return torch.randn(count, 2, generator=rng, dtype=torch.float64)
 

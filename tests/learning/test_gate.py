@@ -85,7 +85,6 @@ def test_a_bound_covers_failures_that_are_hidden_by_noise():
 
 
 def accepted(draw: Any, looks: range, bound: float | None, count: int = TESTS) -> int:
-    """Count the tests that accept at some look."""
     better, generator = 0, torch.Generator().manual_seed(0)
     for _ in range(count):
         test, d, seen = PairedTest(bound=bound), draw(max(looks), generator).double(), 0

@@ -51,7 +51,6 @@ def assert_steps(
     weight: Tensor | None = None,
     **own: Any,
 ) -> None:
-    """Assert that a step is the reference's."""
     before = reference.theta()
     expected = reference.step(s, a, target, own.get("penalty"), weight)
     report = optimizer.step(s, a, target, **own)

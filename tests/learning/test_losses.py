@@ -43,7 +43,6 @@ PREVIEW: dict[str, Any] = {"preview_key": "preview"}
 
 
 def make_mpc(seed: int, n_d: int = 0) -> QPMPC:
-    """Make a QP initialised by ``seed``; its bounds are buffers."""
     learn = ("H", "q", "c", "C", "b")
     bounds = ([-BOUND], [BOUND])
     return random_mpc(seed, learn=learn, state_slack=5.0, action_bounds=bounds, n_d=n_d)
@@ -154,7 +153,6 @@ LOSSES: dict[str, Callable[[], LossModule]] = {
 
 
 def make_loss(name: str, seed: int = 0) -> LossModule:
-    """Make one of `LOSSES` with its value estimator."""
     torch.manual_seed(seed)
     loss = LOSSES[name]()
     loss.make_value_estimator(gamma=GAMMA)
@@ -193,7 +191,6 @@ def make_batch(loss: LossModule | None = None) -> TensorDict:
 
 
 def total(loss: LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
-    """Sum the losses of a module, with seeded noise."""
     torch.manual_seed(seed)
     out = loss(batch.copy())
     return torch.stack([x for key, x in out.items() if key.startswith("loss")]).sum()

@@ -2,11 +2,14 @@
 
 import copy
 import math
+from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import MultiStep
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.objectives import SoftUpdate
 
 from tests.transitions import (
@@ -22,7 +25,7 @@ from tests.transitions import (
     make_operator,
     perturb,
 )
-from torch_qpmpc import QPMPC
+from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss
 from torch_qpmpc.learning.td_error import inverse_variance
 
 
@@ -135,7 +138,6 @@ def test_compiled_without_graph_breaks():
 
 
 def expected_step(mpc: QPMPC, td: TensorDictBase, clip: float = math.inf) -> list[Tensor]:
-    """Compute E[delta grad Q], one gradient of Q at a time."""
     L = -td["next", "reward"].squeeze(-1)
     go_on = 1 - td["next", "terminated"].squeeze(-1).double()
     V, Q = mpc.value(td["next", "observation"]), mpc.action_value(td["observation"], td["action"])
@@ -278,3 +280,294 @@ def test_c_stays_without_a_usable_transition_or_a_discount():
     loss.make_value_estimator()
     td["next", "reward"] = torch.full((7, 9, 1), torch.nan)
     assert loss.centre_(td) == 0.0
+
+
+# The Q-learning loss under renamed keys, and without a TensorDict
+
+
+def unravel_keys(key: Any) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key
+
+
+def test_keys_that_are_renamed_late_reach_the_estimator():
+    loss = QPQLearningLoss(make_operator({"state_value_key": "value_2"}))  # it writes this key
+    loss.set_keys(value="value_2")
+    loss.make_value_estimator("td0")
+    names = ("advantage", "value_target", "reward", "done", "terminated")
+    loss.set_keys(**{name: f"{name}_2" for name in names})
+    keys = loss.value_estimator.tensor_keys
+    assert [getattr(keys, name) for name in names] == [f"{name}_2" for name in names]
+    assert ("next", "reward_2") in loss.in_keys
+    assert ("next", "reward") not in loss.in_keys
+
+
+RENAMED = {
+    "observation": ("agent", "state"),
+    "action": ("agent", "force"),
+    "state_value": "minus_V",
+    "state_action_value": ("critic", "minus_Q"),
+    "reward": ("agent", "minus_L"),
+    "done": "over",
+    "terminated": ("flags", "failed"),
+    "priority": ("replay", "priority"),
+}
+
+
+def make_renamed(estimator: str) -> tuple[QPQLearningLoss, QPQLearningLoss, TensorDict, TensorDict]:
+    """Make the same loss and batch with default keys and with renamed, nested ones."""
+    names = ("observation", "action", "state_value", "state_action_value")
+    operator = make_operator()
+    renamed = QPActorValueOperator(
+        operator.module, **{f"{name}_key": RENAMED[name] for name in names}
+    )
+    loss, other = QPQLearningLoss(operator), QPQLearningLoss(renamed)
+    other.set_keys(
+        value=RENAMED["state_value"],
+        **{k: RENAMED[k] for k in ("state_action_value", "action", "reward", "done")},
+        **{k: RENAMED[k] for k in ("terminated", "priority")},
+    )
+    for module in (loss, other):
+        module.make_value_estimator(estimator, gamma=GAMMA)
+    td = make_batch(3, 4)
+    new = TensorDict({}, batch_size=td.batch_size)
+    for name in ("observation", "action"):
+        new[RENAMED[name]] = td[name]
+    for name in ("observation", "reward", "done", "terminated"):
+        key = RENAMED[name]
+        new[("next", *unravel_keys(key))] = td["next", name]
+    return loss, other, td, new
+
+
+@pytest.mark.parametrize("estimator", TRACE)
+def test_renamed_and_nested_keys(estimator):
+    loss, other, td, new = make_renamed(estimator)
+    out = other(new)
+    assert torch.equal(out["loss_value"], loss(td)["loss_value"])
+    assert torch.equal(new["replay", "priority"], td["td_error"])
+    assert "td_error" not in set(new.keys())
+
+
+def test_dispatch_without_a_tensordict():
+    loss, other, td, new = make_renamed("td0")
+    out = loss(td.clone())
+    arguments = {
+        "observation": td["observation"],
+        "action": td["action"],
+        "next_observation": td["next", "observation"],
+        "next_reward": td["next", "reward"],
+        "next_done": td["next", "done"],
+        "next_terminated": td["next", "terminated"],
+    }
+    assert {"_".join(unravel_keys(key)) for key in loss.in_keys} == set(arguments)
+    results = loss(**arguments)
+    assert len(results) == len(loss.out_keys) == 8
+    for key, value in zip(loss.out_keys, results, strict=True):
+        assert torch.equal(value, out[key]), key
+
+    renamed = {"_".join(unravel_keys(key)): new[key] for key in other.in_keys}
+    assert "next_agent_minus_L" in renamed
+    assert torch.equal(other(**renamed)[0], out["loss_value"])
+    loss.select_out_keys("loss_value")
+    assert torch.equal(loss(**arguments), out["loss_value"])
+
+
+# TorchRL's contract of a loss module: estimators, target networks, copies, and resets
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_multi_step_returns(n):
+    """r_t + gamma r_{t+1} + .., and gamma^k V(s_{t+k}) k steps on, cut at an episode's end.
+
+    Episodes are only truncated, because `MultiStep` keeps the flags of the first step.
+    """
+    td = make_batch(3, 6)
+    td["next", "terminated"] = torch.zeros(3, 6, 1, dtype=torch.bool)
+    td["collector", "mask"] = torch.ones(3, 6, dtype=torch.bool)
+    operator = make_operator()
+    V = operator.module.value(td["next", "observation"]).detach()
+    flags: Any = td["next"]
+    expected = torch.zeros(3, 6, dtype=torch.float64)
+    for i in range(3):
+        for t in range(6):
+            for k in range(n):
+                j = t + k
+                expected[i, t] += GAMMA**k * flags["reward"][i, j, 0]
+                if flags["done"][i, j] or j == 5 or k == n - 1:
+                    expected[i, t] -= GAMMA ** (k + 1) * V[i, j]
+                    break
+    batch = MultiStep(gamma=GAMMA, n_steps=n)(td.clone())
+    out = make_loss(operator=operator, reduction="none")(batch)
+    delta = expected - hand_prediction(operator.module, td)
+    torch.testing.assert_close(out["loss_value"], 0.5 * delta**2, atol=1e-6, rtol=0)
+
+
+class Spy(QPActorValueOperator):
+    seen: ExplorationType | None = None
+
+    def forward(self, tensordict: Any) -> Any:
+        Spy.seen = exploration_type()
+        return super().forward(tensordict)
+
+
+def test_exploration_is_off_inside():
+    loss = make_loss(operator=Spy(make_operator().module))
+    with set_exploration_type(ExplorationType.RANDOM):
+        loss(make_batch(2))
+        assert Spy.seen == ExplorationType.DETERMINISTIC
+        assert exploration_type() == ExplorationType.RANDOM
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+@pytest.mark.parametrize("delay_value", [False, True])
+def test_reset_parameters_recursive(delay_value):
+    loss = make_loss(delay_value=delay_value)
+    start = loss.value_network_params.clone()
+    perturb(loss)
+    with torch.no_grad():
+        loss.target_value_network_params.apply_(lambda x: x.add_(1) if x.is_floating_point() else x)
+    loss.reset_parameters_recursive()
+    for key, leaf in learned_leaves(loss).items():
+        torch.testing.assert_close(leaf, start[key], atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            loss.target_value_network_params[key], start[key].data, atol=1e-12, rtol=0
+        )
+
+
+# The Q-learning loss where a QP has no certified solution
+
+
+def hard_operator() -> QPActorValueOperator:
+    """Make an operator with hard states: a start outside their bounds is infeasible."""
+    return make_operator(state_slack=torch.inf, learn=("H", "c", "C"))
+
+
+def feasible_batch(count: int) -> TensorDict:
+    td = make_batch(count)
+    parts: list[Any] = [td, td["next"]]
+    for where in parts:
+        where["observation"] *= 0.3
+    td["action"] *= 0.3
+    td["next", "terminated"] = torch.zeros(count, 1, dtype=torch.bool)
+    return td
+
+
+def gradients(loss: QPQLearningLoss, td: TensorDictBase) -> tuple[TensorDictBase, list[Tensor]]:
+    out = loss(td)
+    result = torch.autograd.grad(out["loss_value"], list(loss.parameters()))
+    return out, list(result)
+
+
+@pytest.mark.parametrize("bad", [5.0, torch.nan, torch.inf])
+@pytest.mark.parametrize("where", ["observation", "action", ("next", "observation")])
+def test_unsolved_samples_are_masked(where, bad):
+    operator, td = hard_operator(), feasible_batch(6)
+    mean = make_loss(operator=operator)
+    solved = td[torch.tensor([0, 1, 3, 4, 5])]
+    expected, step = gradients(make_loss(operator=operator, reduction="sum"), solved)
+    td[where][2] = bad
+    out, total = gradients(make_loss(operator=operator, reduction="sum"), td)
+    assert out["unsolved"].item() == 1
+    torch.testing.assert_close(out["loss_value"], expected["loss_value"])
+    for gradient, other in zip(total, step, strict=True):
+        assert other.norm() > 0
+        torch.testing.assert_close(gradient, other)
+    for key in METADATA:
+        torch.testing.assert_close(out[key], expected[key], msg=key)
+    assert td["td_error"][2] == 0
+    assert td["td_error"].isfinite().all()
+    # In the mean it counts with zero error, so that alpha keeps its meaning.
+    torch.testing.assert_close(mean(td)["loss_value"], expected["loss_value"] / 6)
+
+
+@pytest.mark.parametrize("estimator", TRACE)
+def test_an_unsolved_value_after_termination_is_not_needed(estimator):
+    """The target is -L alone, so the sample counts for any state after the end."""
+    operator = hard_operator()
+    td = feasible_batch(4)
+    td["next", "done"] = torch.tensor([[False], [True], [False], [True]])
+    td["next", "terminated"] = td["next", "done"].clone()
+    expected = make_loss(estimator, operator, reduction="none")(td.clone())
+    td["next", "observation"][1] = 5.0
+    td["next", "observation"][3] = torch.nan
+    out = make_loss(estimator, operator, reduction="none")(td)
+    assert out["unsolved"].item() == 0
+    assert torch.equal(out["loss_value"], expected["loss_value"])
+    Q = operator.module.action_value(td["observation"], td["action"])
+    delta = -td["next", "reward"].squeeze(-1) - Q
+    torch.testing.assert_close(out["loss_value"][[1, 3]], 0.5 * delta[[1, 3]] ** 2)
+    td["next", "terminated"][1] = False  # truncated instead, so that its value is needed
+    assert make_loss(estimator, operator)(td)["unsolved"].item() >= 1
+
+
+def test_without_masking_an_unsolved_qp_raises():
+    operator = make_operator(state_slack=torch.inf, on_failure="raise")
+    td = feasible_batch(3)
+    td["observation"][0] = 5.0
+    with pytest.raises(RuntimeError, match="1 of 3 QPs have no certified solution"):
+        make_loss(operator=operator)(td)
+
+
+def test_ctrl_c_reaches_the_caller_and_leaves_theta_in_its_place(monkeypatch):
+    operator, td = hard_operator(), feasible_batch(3)
+    loss = make_loss(operator=operator)
+    before, theta = loss(td.clone())["loss_value"], [*operator.parameters()]
+
+    def stopped(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(QPActorValueOperator, "forward", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            loss(td.clone())
+    assert all(x is y for x, y in zip(operator.parameters(), theta, strict=True))
+    assert torch.equal(loss(td.clone())["loss_value"], before)
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("reduction", ["sum", "mean"])
+def test_invalid_rewards_are_left_out_and_counted(bad, reduction):
+    operator, td = hard_operator(), feasible_batch(6)
+    solved = td[torch.tensor([0, 1, 3, 5])]
+    expected, step = gradients(make_loss(operator=operator, reduction="sum"), solved)
+    td["next", "reward"][2] = bad
+    td["next", "observation"][4] = 5.0  # and one without a solution
+    loss = make_loss(operator=operator, reduction=reduction)
+    message = r"\('next', 'reward'\): 1 of 6 rewards are NaN or infinite\. Those transitions are"
+    with pytest.warns(RuntimeWarning, match=message) as caught:
+        out, total = gradients(loss, td)
+    assert len(caught) == 1
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (1, 1)
+    count = 6 if reduction == "mean" else 1
+    torch.testing.assert_close(out["loss_value"], expected["loss_value"] / count)
+    for gradient, other in zip(total, step, strict=True):
+        torch.testing.assert_close(gradient, other / count)
+    for key in METADATA:
+        torch.testing.assert_close(out[key], expected[key], msg=key)
+    assert td["td_error"][2] == 0
+
+
+@pytest.mark.parametrize("estimator", ["td1", "tdlambda"])
+def test_an_invalid_reward_spoils_only_the_returns_that_contain_it(estimator):
+    operator, td = hard_operator(), make_batch(2, 6)
+    parts: list[Any] = [td, td["next"]]
+    for part in parts:
+        part["observation"] *= 0.3
+    td["action"] *= 0.3
+    td["next", "terminated"] = td["next", "done"] = torch.zeros(2, 6, 1, dtype=torch.bool)
+    td["next", "done"][0, 1] = True
+    expected = make_loss(estimator, operator, reduction="none")(td.clone())["loss_value"]
+    td["next", "reward"][0, 3], td["next", "observation"][0, 5] = torch.inf, 5.0
+    loss = make_loss(estimator, operator, reduction="none")
+    with pytest.warns(RuntimeWarning, match="1 of 12 rewards"):
+        out = loss(td)
+    with pytest.warns(RuntimeWarning, match="1 of 12 rewards"):
+        target = loss.target(td)
+    invalid, unsolved = torch.zeros(2, 2, 6, dtype=torch.bool)
+    invalid[0, [2, 3]] = True  # it, and the step before it in its episode
+    unsolved[0, [4, 5]] = True
+    assert torch.equal(target.isnan(), invalid)
+    assert torch.equal(target == -torch.inf, unsolved)
+    assert (out["invalid_reward"].item(), out["unsolved"].item()) == (2, 2)
+    kept = ~(invalid | unsolved)
+    torch.testing.assert_close(out["loss_value"][kept], expected[kept])
+    assert (out["loss_value"][~kept] == 0).all()

@@ -160,7 +160,6 @@ RATES = {"cost": 1e-2, "constraints": 1e-3}
 
 
 def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty):
-    """Make an update and its optimiser."""
     loss = make_loss(mpc, td_error_clip=1.0)
     if name == "gauss_newton":
         optimizer = GaussNewton(mpc)
