@@ -16,7 +16,6 @@ def _quick(rough_fits: None) -> None:
 
 @pytest.fixture
 def store_task() -> Iterator[None]:
-    """Register ``task=store`` for a test."""
     runpy.run_path(str(Path(__file__).parents[1] / "store_task.py"))
     yield
     del TASKS["store"]

@@ -61,7 +61,6 @@ HOPELESS = (*DATA, "task.kwargs={gain: 0.001, price: 100}")
 
 @pytest.fixture(autouse=True)
 def _plant(register):
-    """Make the plant a lag."""
     register(Lag, name="Lag-v0")
 
 
@@ -74,7 +73,6 @@ def chosen(*overrides):
 
 
 def start_of(cfg, physics):
-    """Return the MPC of a log, with zero action held."""
     start = candidates(cfg, physics, collect_log(cfg, physics))[LINEAR]
     return start._replace(action=torch.zeros(1, dtype=torch.float64))
 
@@ -172,7 +170,6 @@ def test_a_held_action_has_a_cost_of_its_own(hessian):
 
 
 def trained(cfg, folder) -> FinishedRun:
-    """Train; the files have the policies that were evaluated."""
     summary, run = train.train(cfg, str(folder), quiet=True), FinishedRun(folder)
     for name, policy in (("J_start", run.start), ("J_best", run.policy)):
         J = evaluate(cfg, warm_policy(policy), run.physics).J
@@ -246,8 +243,6 @@ def test_networks_are_no_start_of_a_run_that_needs_C(settings, there):
 
 
 class Swing(Lag):
-    """A swing, of which only the position is measured."""
-
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.rate = 0.0
@@ -308,8 +303,6 @@ class Broken(Lag):
 
 
 class Unpriced(Lag):
-    """Has no reward."""
-
     def step(self, action):
         y, _, *rest = super().step(action)
         return y, np.nan, *rest

@@ -2,7 +2,6 @@
 
 import math
 import re
-import sys
 from typing import Any
 
 import pytest
@@ -158,17 +157,6 @@ def test_missing_keys(key):
 )
 def test_values_that_do_not_fit_each_other(overrides):
     make_config(*overrides.split())
-
-
-def test_the_step_rule_needs_its_solver(monkeypatch):
-    monkeypatch.setitem(sys.modules, "clarabel", None)
-    with pytest.raises(QPError, match=r"step: got 'sdp' without Clarabel, .* pip install"):
-        make_config("step=sdp")
-
-
-def test_flatten():
-    tree = {"a": 1, "b": {"c": [1, 2], "d": {"e": None}}}
-    assert flatten(tree) == {"a": 1, "b.c": [1, 2], "b.d.e": None}
 
 
 @pytest.mark.parametrize("name", choices("ablation"))

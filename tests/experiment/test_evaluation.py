@@ -41,7 +41,6 @@ def proportional(gain: float) -> Policy:
 
 @pytest.fixture
 def rivals(store_task) -> None:
-    """Give the store proportional controls as rivals."""
     named = {"weak": lambda _: proportional(0.5), "strong": lambda _: proportional(5.0)}
     register(dataclasses.replace(TASKS["store"], rivals=named))
 

@@ -15,7 +15,6 @@ from torch_qpmpc.mpc.tightening import tighten
 
 @pytest.fixture
 def covariances(monkeypatch) -> list[torch.Tensor]:
-    """Record the covariances that a rival tightens by."""
     seen = []
 
     def record(mpc, covariances, *args, **kwargs):

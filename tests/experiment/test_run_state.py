@@ -54,7 +54,6 @@ def test_a_resumed_run_equals_an_undisturbed_one(tmp_path, monkeypatch, override
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stop a run in its third update, after the checkpoint of the second."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
         stop(patch, make_config(*RUN, "eval_interval=2"), folder, 3)
@@ -63,7 +62,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Train the same run without a stop."""
     folder = tmp_path_factory.mktemp("whole")
     train.train(make_config(*RUN, "eval_interval=2"), str(folder))
     return folder
@@ -71,7 +69,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def stopped(run: Path, tmp_path: Path) -> Path:
-    """Copy the stopped run."""
     return shutil.copytree(run, tmp_path / "run")
 
 

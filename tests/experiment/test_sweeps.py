@@ -24,7 +24,6 @@ LAUNCHERS = {
 
 
 def arguments(folder: Path, *overrides: str) -> list[str]:
-    """Return the arguments of ``-m +study=paper`` with small runs."""
     study = ("-m", "+study=paper", "constraint=free", "noise=gaussian")
     short = ("updates=1", "eval_interval=1", "task.eval_steps=2")
     return [*study, *SMALL, *short, f"hydra.sweep.dir={folder}", *overrides]
@@ -48,7 +47,6 @@ def test_a_launcher_runs_the_study(launcher, tmp_path):
 
 
 def sweep(folder: Path, *overrides: str) -> None:
-    """Run a sweep of small runs in this process, one after the other."""
     run_command(*arguments(folder, "hydra/launcher=basic", *overrides))
 
 
