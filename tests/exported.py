@@ -47,7 +47,6 @@ def house(horizon: int = 8) -> QPMPC:
 
 
 def tied(horizon: int = 8, **options: Any) -> QPMPC:
-    """Make a linear MPC scheme with mixed constraints, of which a terminal one is hard."""
     return QPMPC.from_model(
         torch.tensor([[1.0, 0.2], [-0.1, 0.95]]),
         torch.tensor([[0.0], [0.2]]),
@@ -145,7 +144,6 @@ def draw_known(mpc: Any, count: int, seed: int = 0) -> np.ndarray:
 
 
 def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[Library, Tables]:
-    """Compile the tables of a QP, without a comparison."""
     tables = make_tables(mpc)
     limit = PER_ROW * len(tables.Q) + AT_LEAST
     chosen = Settings("policy", "float64", limit)._replace(**settings)
@@ -156,7 +154,6 @@ def load(mpc: Any, flags: tuple[str, ...] = ("-O0",), **settings: Any) -> tuple[
 
 
 def read(folder: Path, name: str = "policy", dtype: str = "float64") -> Library:
-    """Compile the files of an export."""
     texts = {f"{name}.{end}": (folder / f"{name}.{end}").read_text() for end in "hc"}
     return Library(texts, name, dtype)
 

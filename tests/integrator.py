@@ -1,6 +1,5 @@
 """A double integrator with steps of 0.2, of which the tests of proofs ask questions."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,7 @@ A, B = np.array([[1.0, 0.2], [0.0, 1.0]]), np.array([[0.02], [0.2]])
 BOX = Polytope.box([-1.0, -0.5], [1.0, 0.5])
 
 
-def integrator(
-    horizon: int = 3, make: Callable[..., QPMPC] = QPMPC.from_model, **options: Any
-) -> QPMPC:
-    """Make the MPC that keeps the state within `BOX`, with soft bounds by default."""
+def integrator(horizon: int = 3, **options: Any) -> QPMPC:
     arguments = {"stage_weight": [1.0, 1.0, 0.1], "state_bounds": (BOX.lower, BOX.upper)}
     arguments |= {"action_bounds": ([-1.0], [1.0]), "solver": "daqp"}
-    return make(A, B, horizon, **arguments | options)
+    return QPMPC.from_model(A, B, horizon, **arguments | options)

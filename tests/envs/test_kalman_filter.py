@@ -31,7 +31,6 @@ ID, STEPS = "Pendulum-v1", 7
 
 
 def model(n: int = 4, n_y: int = 3, n_d: int = 0) -> Innovations:
-    """Return a random stable model of an input."""
     rng = np.random.default_rng(0)
     A = rng.normal(size=(n, n))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()

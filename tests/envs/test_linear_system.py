@@ -31,7 +31,6 @@ IDS = ["torch_qpmpc/PointMass-v0", "torch_qpmpc/GrosZanonLTI-v0"]
 
 @pytest.fixture(params=PLANTS)
 def plant(request: pytest.FixtureRequest) -> LinearSystem:
-    """Return each plant in turn, with each kind of noise."""
     return PLANTS[request.param]
 
 

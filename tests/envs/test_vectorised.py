@@ -38,7 +38,6 @@ ENVS = {
 
 @pytest.fixture(params=ENVS)
 def make(request: pytest.FixtureRequest) -> Callable[..., Any]:
-    """Return a function that makes each environment in turn."""
     return ENVS[request.param]
 
 

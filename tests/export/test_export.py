@@ -298,15 +298,6 @@ class Failing(Library):
 
 
 @needs_compiler
-def test_the_self_test_fails_for_other_tables(tmp_path):
-    (header, source) = export_c(tied(), tmp_path).files
-    text = source.read_text()
-    start = text.index("U_OFFSET[1] =") + len("U_OFFSET[1] =\n")
-    source.write_text(f"{text[:start]}{{0.5}};{text[text.index(';', start) + 1 :]}")
-    assert read(header.parent).selftest() == 1
-
-
-@needs_compiler
 def test_two_policies_link_into_one_program(tmp_path):
     export_c(tied(), tmp_path, name="one")
     export_c(rates(), tmp_path, name="two")

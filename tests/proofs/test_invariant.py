@@ -23,12 +23,10 @@ def one_gain(monkeypatch):
 
 
 def bounded(low: float, slack: float) -> QPMPC:
-    """Return a policy that accelerates from x < low beyond the velocity's bound."""
     return scheme(state_bounds=([low, -np.inf], [np.inf, np.inf]), state_slack=slack)
 
 
 def stays(mpc: QPMPC, plants: list[Plant], polytope: Polytope, steps: int = 10) -> bool:
-    """Return True if no sample leaves the polytope, with noise at its corners."""
     generator = np.random.default_rng(0)
     x = generator.uniform(polytope.lower, polytope.upper, (1000, 2))
     x = np.concatenate((x[(x @ polytope.A.T <= polytope.b).all(1)], polytope.vertices()))

@@ -1,9 +1,8 @@
 """Polytopes: bounding boxes, vertices, and their errors."""
 
 import numpy as np
-import pytest
 
-from torch_qpmpc import QPError
+from tests.refused import refused
 from torch_qpmpc.proofs import Polytope
 
 TRIANGLE = [[-1.0, 0.0], [0.0, -1.0], [1.0, 1.0]], [0.0, 0.0, 1.0]
@@ -29,24 +28,19 @@ def test_a_box_has_all_corners():
     assert fixed.vertices()[:, -1].tolist() == [-1.0, 1.0]
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: Polytope.of([1.0], [1.0]), "shapes (1,) and (1,)"),
-        (lambda: Polytope.of([[np.nan]], [1.0]), "NaN or inf"),
-        (lambda: Polytope.of([[1.0], [-1.0]], [0.0, -1.0]), "an empty set"),
-        (lambda: Polytope.of([[1.0]], [1.0]), "an unbounded set"),
-        (lambda: Polytope.of(CONE, np.ones(4)), "an unbounded set"),
-        (lambda: Polytope.box([0.0], [1.0, 2.0]), "shapes (1,) and (2,)"),
-        (lambda: Polytope.box([1.0], [0.0]), "expected lower <= upper"),
-        (lambda: Polytope.box(np.zeros(9), np.ones(9)).vertices(), "9 dimensions"),
-        (
-            lambda: Polytope.of([[1.0, 1], [-1, -1], [1, -1], [-1, 1]], [0.0, 0, 1, 1]).vertices(),
-            "a flat polytope",
-        ),
-    ],
+LINE = [[1.0, 1], [-1, -1], [1, -1], [-1, 1]], [0.0, 0, 1, 1]
+
+
+@refused(
+    (lambda: Polytope.of([1.0], [1.0]), r".*shapes \(1,\) and \(1,\)"),
+    (lambda: Polytope.of([[np.nan]], [1.0]), ".*NaN or inf"),
+    (lambda: Polytope.of([[1.0], [-1.0]], [0.0, -1.0]), ".*an empty set"),
+    (lambda: Polytope.of([[1.0]], [1.0]), ".*an unbounded set"),
+    (lambda: Polytope.of(CONE, np.ones(4)), ".*an unbounded set"),
+    (lambda: Polytope.box([0.0], [1.0, 2.0]), r".*shapes \(1,\) and \(2,\)"),
+    (lambda: Polytope.box([1.0], [0.0]), ".*expected lower <= upper"),
+    (lambda: Polytope.box(np.zeros(9), np.ones(9)).vertices(), ".*9 dimensions"),
+    (lambda: Polytope.of(*LINE).vertices(), ".*a flat polytope"),
 )
-def test_errors(make, sentence):
-    with pytest.raises(QPError) as raised:
-        make()
-    assert sentence in str(raised.value)
+def test_errors(make):
+    make()
