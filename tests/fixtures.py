@@ -48,7 +48,6 @@ def one_thread() -> None:
 
 @pytest.fixture(params=[*BACKENDS, "qpsolvers:clarabel"])
 def solver(request: pytest.FixtureRequest) -> str:
-    """Return the name of each backend in turn."""
     return request.param
 
 

@@ -16,8 +16,6 @@ def penalty(mpc: QPMPC, S: Tensor) -> float:
 
 
 class Reference:
-    """The steps of a `GaussNewton` without a trust region."""
-
     def __init__(self, mpc: QPMPC, optimizer: GaussNewton) -> None:
         groups = optimizer.param_groups
         self.mpc = mpc
@@ -43,7 +41,6 @@ class Reference:
         return [torch.stack(part) for part in zip(*rows, strict=True)]
 
     def units(self, z: Tensor) -> list[Tensor]:
-        """Compute U of each leaf, flattened."""
         mpc, n = self.mpc, self.mpc.n_x + self.mpc.n_u
         preview = (mpc.horizon + 1) * mpc.n_d
         d, stages = z[:, :preview], z[:, preview:]
@@ -66,7 +63,6 @@ class Reference:
         return found
 
     def metric(self, gradients: list[Tensor], z: Tensor) -> Tensor:
-        """Compute the diagonal of D from the gradients of a new batch."""
         units = self.units(z)
         sizes = dict.fromkeys(self.parts, 0.0)
         for part, rows, unit in zip(self.parts, gradients, units, strict=True):
@@ -87,7 +83,6 @@ class Reference:
         S: Tensor | None = None,
         weight: Tensor | None = None,
     ) -> Tensor:
-        """Compute the step of theta."""
         solution, root = self.mpc.solve(s, a), torch.ones(len(s)).double()
         if weight is not None:
             root = weight.sqrt()

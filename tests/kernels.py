@@ -15,7 +15,6 @@ def up_to_date() -> bool:
 
 
 def compile_kernels() -> None:
-    """Train briefly, solve a QP of large numbers, plan on levels, and identify models."""
     import numpy as np
 
     import train

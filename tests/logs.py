@@ -57,5 +57,4 @@ def room(steps: int = 60, seed: int = 0) -> pd.DataFrame:
 
 
 def lengths(log: Log) -> list[int]:
-    """Return the steps of each trajectory."""
     return [part.steps for part in log.trajectories]

@@ -35,7 +35,6 @@ MIXED: dict[str, Any] = {
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
-    """Draw standard normal entries."""
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
@@ -44,7 +43,6 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
 def central_difference(
     function: Callable[[], Tensor], leaf: Tensor, direction: Tensor, step: float
 ) -> Tensor:
-    """Return the slope of a function while ``leaf`` moves in place along a direction."""
     ends = []
     for sign in (1, -1):
         leaf.add_(sign * step * direction)
@@ -54,7 +52,6 @@ def central_difference(
 
 
 def times(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Multiply matrices and vectors over any batch dimensions."""
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
@@ -213,25 +210,17 @@ def reduced_of(known: KnownQP) -> Reduced:
 def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
     """Make a backend's input in tensors, and its exact solution."""
     reduced, programs = reduced_of(known), programs_of(known)
-    v = known.z.reshape(len(programs), -1) - expanded(programs)
+    fixed = to_tensor(programs.fixed)
+    free = torch.cat((fixed, fixed.new_zeros(len(programs), reduced.H.shape[-1])), dim=-1)
+    start = multiply(reduced.T, to_tensor(programs.group), free) + reduced.z_0
+    v = known.z.reshape(len(programs), -1) - start
     v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
     lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
     steps = torch.zeros(len(programs), dtype=torch.int64)
     return SoftQPs._make(map(to_tensor, programs.reduced_qps())), BackendSolution(v, lam, steps)
 
 
-def expanded(programs: Programs, v: Tensor | None = None) -> Tensor:
-    """Expand free variables ``(B, d)``, zero by default, to z ``(B, n_z)``."""
-    reduced = Reduced._make(map(to_tensor, programs.prepared.reduced(programs.n_f)))
-    fixed = to_tensor(programs.fixed)
-    if v is None:
-        v = fixed.new_zeros(len(programs), reduced.H.shape[-1])
-    free = torch.cat((fixed, v), dim=-1)
-    return multiply(reduced.T, to_tensor(programs.group), free) + reduced.z_0
-
-
 def solution_of(known: KnownQP) -> dict[str, Tensor]:
-    """Return the known solution under the names of `QPSolution`."""
     names = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
     return {name: getattr(known, name) for name in names}
 
@@ -279,7 +268,6 @@ def random_states(count: int, n: int = 2, *, size: float = 1.5, seed: int = 0) -
 
 
 def step(mpc: QPMPC, rate: float = 1e-3) -> None:
-    """Take one training step on the sum of some values."""
     optimizer = torch.optim.Adam(mpc.parameters(), lr=rate)
     mpc(random_states(4)).sum().backward()
     optimizer.step()

@@ -10,7 +10,6 @@ from torch_qpmpc import QuadraticProgram
 
 
 def arrays(qp: QuadraticProgram) -> tuple[np.ndarray, ...]:
-    """Return H, q, c, C, b, G, lb, ub, w of one QP."""
     return tuple(tensor.detach().numpy().astype(float) for tensor in qp.tensors())
 
 

@@ -43,7 +43,6 @@ SMALL = (
 
 
 def make_config(*overrides: str) -> Any:  # whose parts are narrower than those of each Config
-    """Make the `Config` of overrides, the last one of a key counting."""
     return Config.of(compose_config(*overrides))
 
 
@@ -98,19 +97,16 @@ def ended(*words: object, cwd: Path = CONFIGS.parent, **environment: str) -> Any
 
 
 def choices(group: str) -> list[str]:
-    """List the choices of a group."""
     return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
 
 
 def linear_system(cfg: Config) -> LinearSystem:
-    """Make a plant with a true model."""
     physics = make_physics(cfg)
     assert isinstance(physics, LinearSystem)
     return physics
 
 
 def true_mpc(cfg: Config, physics: LinearSystem) -> QPMPC:
-    """Make the MPC with the true model."""
     mpc = make_true_mpc(cfg, physics)
     assert mpc is not None
     return mpc

@@ -15,7 +15,6 @@ from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 
 def stop(monkeypatch: pytest.MonkeyPatch, cfg: Config, folder: Path, update: int) -> None:
-    """Run or resume, and stop in ``update``."""
     state = None
     if (folder / "config.yaml").exists():
         cfg, state = begun(folder)
@@ -39,7 +38,6 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, update: int) -> None:
 
 
 def begun(folder: Path) -> tuple[Config, dict[str, Any] | None]:
-    """Return the configuration and the state of a stopped run."""
     cfg = read_config(folder)
     state, summary = settled(cfg, folder, sweep=False)
     assert summary is None
@@ -47,7 +45,6 @@ def begun(folder: Path) -> tuple[Config, dict[str, Any] | None]:
 
 
 def go_on(folder: Path) -> None:
-    """Resume a stopped run and finish it."""
     cfg, state = begun(folder)
     train.train(cfg, str(folder), state)
 
@@ -66,6 +63,5 @@ def assert_same_numbers(folder: Path, whole: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return what is in each file of a folder, but for its lock."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
     return {str(path): path.read_bytes() for path in files}

@@ -79,7 +79,6 @@ def scheme(plant: Store, gamma: float = 0.9) -> Scheme:
 
 
 def make_mpc(plant: Store | None = None) -> QPMPC:
-    """Make the QP of a store's `scheme`, with all of theta learned."""
     plant = Store() if plant is None else plant
     return QPMPC(scheme(plant), learn=LEARN, solver="daqp", on_failure="mask")
 

@@ -176,7 +176,6 @@ def commands(text: str) -> list[str]:
 
 
 def documented() -> dict[str, list[str]]:
-    """Return the commands of each page and notebook, each once, in order."""
     texts = dict(PAGES)
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text(encoding="utf-8"))["cells"]

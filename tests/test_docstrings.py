@@ -44,7 +44,6 @@ def is_described(word: str, doc: str) -> bool:
 
 
 def lacking(name: str, docs: list[str | None], expected: list[str]) -> Iterator[str]:
-    """What docstrings lack, the first of which begins with a sentence."""
     found = [inspect.cleandoc(doc) for doc in docs if doc]
     first = found[0].split("\n\n")[0] if found else ""
     if len(first) <= 15 or first[-1] not in ".:":
@@ -55,7 +54,6 @@ def lacking(name: str, docs: list[str | None], expected: list[str]) -> Iterator[
 
 
 def of_class(name: str, cls: type) -> Iterator[str]:
-    """What the docstrings of a class and of the public methods that it defines lack."""
     ours = [base for base in cls.__mro__ if is_ours(base)]
     makers = [function_of(vars(cls).get(x)) for x in ("__init__", "__post_init__")]
     expected = [x for maker in makers if maker is not None for x in arguments(maker)]

@@ -139,7 +139,7 @@ REFUSED: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "d": (lambda t: simulated(d=t), [[1.0], [2.0], [3.0]]),
     "u": (lambda t: qm.identify({"y": np.arange(9.0), "u": t}, 2), np.sin(np.arange(9))),
     "T": (lambda t: qm.read_log({"T": t, "q": np.arange(9)}, ["T"], ["q"]), [1.0] * 9),
-    "action": (lambda t: qm.identify(steps("action", t), 2), arx_log()["action"]),
+    "action": (lambda t: qm.identify(steps("action", t), 2, order=0), arx_log()["action"]),
     "reward": (
         lambda t: qm.QPMPC.from_data(steps(("next", "reward"), t), 2), torch.ones(3, 40, 1)
     ),

@@ -29,7 +29,6 @@ pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="no notebooks, as in a whe
 
 
 def cells(path: Path) -> list[dict[str, Any]]:
-    """Return the cells of code."""
     notebook = json.loads(path.read_text(encoding="utf-8"))
     return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
 

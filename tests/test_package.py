@@ -21,14 +21,12 @@ pytestmark = pytest.mark.skipif(not EXAMPLES.exists(), reason="not a clone of th
 
 
 def sources(folder: str) -> set[str]:
-    """The files of a folder that belong to the repository."""
     found = (path.relative_to(ROOT) for path in (ROOT / folder).rglob("*") if path.is_file())
     return {str(path) for path in found if "__pycache__" not in path.parts}
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The sdist and the wheel."""
     folder = tmp_path_factory.mktemp("dist")
     ended(sys.executable, "-m", "hatchling", "build", "-d", folder)
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")

@@ -30,7 +30,6 @@ LINEAR = ("gate=true", "gate_interval=4")
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Train a run of the point mass and one of a Gymnasium environment, and stop them."""
     folder = tmp_path_factory.mktemp("from-a-stranger")
     gym = ("task=pendulum", "start=data", "start.transitions=100")
     for name, more in (("linear", LINEAR), ("gym", gym)):
@@ -45,7 +44,6 @@ def mark(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def folder(runs: Path, tmp_path: Path) -> Path:
-    """Copy the run of the point mass."""
     return shutil.copytree(runs / "linear", tmp_path / "runs" / "sweep" / "run")
 
 
@@ -61,7 +59,6 @@ def change(folder: Path, **changes: object) -> None:
 
 
 def resume(folder: Path) -> None:
-    """Repeat the command of the point mass."""
     (folder / "summary.json").unlink(missing_ok=True)
     run_command(*SMALL, *LINEAR, f"hydra.run.dir={folder}")
 
@@ -75,7 +72,6 @@ COMMANDS: dict[str, Callable[[Path], object]] = {
 
 
 def script(folder: Path, mark: Path) -> None:
-    """Let a checkpoint be a program, too."""
     program = shutil.copy(folder / "checkpoint.pt", folder / "checkpoint-previous.pt")
     with zipfile.ZipFile(program, "a") as file:
         file.writestr("__main__.py", f"open({str(mark)!r}, 'w')")

@@ -111,7 +111,6 @@ def by_family(tallies: dict[str, dict[str, Tally]]) -> str:
 
 
 def spread(tallies: list[Tally], name: str) -> str:
-    """Format a count of several solvers."""
     least, most = (f(getattr(tally, name) for tally in tallies) for f in (min, max))
     return f"{least:,}" if least == most else f"{least:,} to {most:,}"
 

@@ -24,8 +24,6 @@ class Case:
 
 
 class Draw(random.Random):
-    """The random numbers of a family, all from one seed."""
-
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
         self.generator = torch.Generator().manual_seed(seed)
@@ -98,6 +96,5 @@ def solvable(known: KnownQP, accuracy: float = ACCURACY) -> Case:
 
 
 def changed(known: KnownQP, **tensors: Tensor) -> KnownQP:
-    """Replace tensors of a QP without checks."""
     parts: dict[str, Any] = vars(known.qp) | tensors
     return replace(known, qp=QuadraticProgram(**parts, check_values=False))

@@ -83,7 +83,6 @@ def judged(name: str, count: int) -> tuple[list[str], bool]:
 
 
 def differences(steps, exact, actions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the differences of u and of the value."""
     u = np.abs(steps.u - actions).max(-1)
     return u, np.abs(steps.value - exact.value) / (1 + np.abs(exact.value))
 

@@ -38,7 +38,6 @@ class Problem(NamedTuple):
 
 
 def box(size: list[float]) -> Known:
-    """Draw states uniformly in a box."""
     return lambda rng, count: rng.uniform(-1, 1, (count, len(size))) * size
 
 

@@ -26,14 +26,12 @@ def well_posed(draw: Draw, count: int) -> Case:
 
 
 def degenerate(draw: Draw, count: int) -> Case:
-    """More active rows than variables."""
     kinds = ("at_lower", "at_upper", "equality")
     hard, soft = draw.rows(kinds, 10, 20), draw.rows((*kinds, "above", "below"), 0, 8)
     return solvable(draw.known(count, hard=hard, soft=soft))
 
 
 def weakly_active(draw: Draw, count: int) -> Case:
-    """Rows at a bound with zero multiplier."""
     soft, hard = draw.rows((*WEAK, *SOFT_ROWS), 1, 8), draw.rows((*WEAK, "at_upper"), 1, 6)
     return solvable(draw.known(count, soft=(*soft, WEAK[0]), hard=hard))
 
@@ -95,7 +93,6 @@ def absent_and_equal_bounds(draw: Draw, count: int) -> Case:
 
 
 def crossing_bounds(draw: Draw, count: int) -> Case:
-    """Equal bounds that cross by rounding."""
     known = draw.known(count, soft=("equality", "above"), hard=("equality",))
     lb, ub = known.qp.lb, known.qp.ub
     up = torch.nextafter(lb, torch.full_like(lb, torch.inf))
@@ -265,7 +262,6 @@ def scaled_everything(draw: Draw, count: int) -> Case:
 
 
 def scaled_mixed(draw: Draw, count: int) -> Case:
-    """`mixed`, with cost, variables and constraints of any size."""
     case = mixed(draw, count)
     units = {name: draw.powers(-4, 4, count) for name in ("cost", "variables", "rows")}
     known = in_units(case.known, **units, equalities=draw.powers(-8, 8, count))
@@ -391,7 +387,6 @@ class Plant:
 
     @property
     def states(self) -> Tensor:
-        """Return the mask of the states in z, ``(n_z,)``."""
         n_x, n = len(self.A), sum(self.B.shape)
         return torch.arange(self.C.shape[1]) % n < n_x
 

@@ -102,7 +102,6 @@ def highs(one: Mixed) -> tuple[float, float]:
 
 
 def scip(one: Mixed) -> tuple[float, float]:
-    """Return the cost of SCIP's best plan and its lower bound."""
     from pyscipopt import Model, quicksum  # pyright: ignore[reportMissingImports]
 
     model = Model()
@@ -185,7 +184,6 @@ def compared(
 
 
 def by_daqp(*parts: np.ndarray) -> None:
-    """Solve a mixed-integer QP by DAQP alone."""
     model = daqp.Model()
     model.setup(*parts)
     model.solve()
@@ -200,7 +198,6 @@ def single(seed: int) -> tuple[qm.QPMPC, torch.Tensor]:
 
 
 def times(designs: int, states: int, by_scip: int) -> None:
-    """Print the times of one on/off input, N = 24."""
     seconds: dict[str, list[float]] = {}
     nodes = []
 

@@ -52,7 +52,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def measure(solver: str) -> list[str]:
-    """Measure a solver, in the order of `NAMES`."""
     double, single = (accuracy(solver, dtype) for dtype in (torch.float64, torch.float32))
     gradients = [gradient(solver, part, place) for part in ("value", "z") for place in KINDS]
     figures = (*double, *single[1:], *gradients)

@@ -88,7 +88,6 @@ def drawn(count: int, seed: int) -> Cases:
 
 
 def answers(cases: Cases, seeds: Iterable[int], nudged: bool) -> Answers:
-    """Solve QPs, and let random controllers begin."""
     found: Answers = {}
     for i, (name, (solver, case)) in enumerate(cases.items()):
         parts = [moved(x, i) if nudged else x for x in (*case.known.qp.tensors(), case.known.fixed)]

@@ -44,7 +44,6 @@ def soak(
     manual, disturbance = {*rng.choice(steps // MANUAL, phases, replace=False)}, np.zeros(m)
 
     def faulty(signal: np.ndarray) -> np.ndarray:
-        """Return a signal with missing and absurd entries."""
         dropped = rng.random(signal.shape) < faults * DROPOUT
         absurd = rng.random(signal.shape) < faults * ABSURD
         counts["dropouts"] += int(dropped.sum())

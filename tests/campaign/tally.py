@@ -41,7 +41,6 @@ class Tally:
         return self.wrong + self.not_finite
 
     def add(self, case: Case, solver: str) -> list[str]:
-        """Solve and count a case; return a line for each failure."""
         tensors = (*case.known.qp.tensors(), case.known.fixed)
         *theta, fixed = operands = tuple(x.detach().requires_grad_() for x in tensors)
         qp = QuadraticProgram(*theta, check_values=False)
@@ -105,7 +104,6 @@ def solve(qp: QuadraticProgram, fixed: Tensor, solver: str) -> QPSolution:
 
 
 def alone(case: Case, i: int) -> tuple[QuadraticProgram, Tensor]:
-    """Return the QP at ``i`` and its fixed entries."""
     qp = case.known.qp
     parts: dict[str, Any] = {
         name: tensor[i] if tensor.ndim > len(event) else tensor

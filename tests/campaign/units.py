@@ -24,8 +24,6 @@ LARGEST = 6
 
 
 class Units(NamedTuple):
-    """A unit for each signal."""
-
     y: np.ndarray
     u: np.ndarray
     x: np.ndarray
@@ -52,7 +50,6 @@ class Drawn(NamedTuple):
     d: np.ndarray
 
     def made(self, units: Units) -> qm.LinearMPC:
-        """Return the MPC in units."""
         (A, B, C), (y, u, x, d), own = self.model, units, dict(self.options)
         for name, unit in (("Q", y), ("R", u), ("dR", u)):
             own[name] = own[name] / unit**2

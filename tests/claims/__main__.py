@@ -43,7 +43,6 @@ class Number:
 
     @property
     def name(self) -> str:
-        """The key or the expression that it is read by."""
         return self.summary or str(self.output)
 
     def quotes(self) -> Iterator[tuple[str, str, float]]:
@@ -53,7 +52,6 @@ class Number:
             yield page, text.replace(f"{{{number}}}", number), value(number)
 
     def read(self, output: str, folder: Path) -> float:
-        """Read the number that a command has made; nan if there is none."""
         if self.summary is None:
             match = re.search(str(self.output), output, re.MULTILINE)
             return value(match[1]) if match else float("nan")
@@ -63,15 +61,12 @@ class Number:
         return float(found)
 
     def holds(self, number: float) -> bool:
-        """Return True if a number lies in the interval."""
         low, high = self.within
         return low <= number <= high
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A command and its numbers; ``quick`` commands run in ``.ci/run``."""
-
     command: str
     numbers: list[Number]
     quick: bool = False
@@ -103,7 +98,6 @@ def value(text: str) -> float:
 
 
 def load(path: Path = CLAIMS) -> list[Claim]:
-    """Load the claims."""
     claims = yaml.safe_load(path.read_text(encoding="utf-8"))
     return [
         Claim(**{**x, "numbers": [Number(**number) for number in x["numbers"]]}) for x in claims
@@ -111,7 +105,6 @@ def load(path: Path = CLAIMS) -> list[Claim]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the commands; return 1 if a page is stale."""
     parser = argparse.ArgumentParser(prog="python -m tests.claims", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="only the commands marked quick")
     parser.add_argument("--only", default="", help="only commands that contain this text")

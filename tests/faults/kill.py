@@ -57,7 +57,6 @@ def campaign(folder: Path, count: int, rng: random.Random, settings: tuple[str, 
 
 
 def start(place: Path, settings: tuple[str, ...]) -> Process:
-    """Start a process that begins or resumes the run in ``place``."""
     settings = (*settings, f"hydra.run.dir={place}")
     process = multiprocessing.get_context("fork").Process(target=command, args=(settings,))
     process.start()
@@ -65,14 +64,12 @@ def start(place: Path, settings: tuple[str, ...]) -> Process:
 
 
 def command(settings: tuple[str, ...]) -> None:
-    """Run ``python train.py settings`` without its output."""
     sys.argv = ["train.py", "--config-path", str(CONFIGS), "hydra/job_logging=disabled", *settings]
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         train.main()
 
 
 def kill(process: Process, place: Path, rng: random.Random) -> str | None:
-    """Kill the process at a random moment and describe it; None if it ended before."""
     (moment,) = rng.choices(list(MOMENTS), list(MOMENTS.values()))
     began, before = time.monotonic(), files(place)
     delay = rng.uniform(*(STARTS if moment == "starting" else TRAINS))
@@ -92,7 +89,6 @@ def kill(process: Process, place: Path, rng: random.Random) -> str | None:
 
 
 def files(place: Path) -> int:
-    """Count the event files: each training process writes its own."""
     return len(list((place / "tensorboard").glob("*")))
 
 

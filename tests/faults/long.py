@@ -53,7 +53,6 @@ class Watch:
 
 
 def resident() -> float:
-    """Return the memory of this process in MB."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) / 1024

@@ -19,7 +19,6 @@ COST: Any = {"stage_weight": [1.0, 1.0, 0.1], "action_bounds": ([-1.0], [1.0]), 
 
 
 def lag_log(noise: float = 0.0, steps: int = 120) -> TensorDict:
-    """Return a log of two outputs that are the state."""
     draw = torch.Generator().manual_seed(0)
     A, B = torch.tensor([[0.9, 0.2], [-0.1, 0.7]]).double(), torch.tensor([[0.5], [1.0]]).double()
     u, e = (torch.randn(steps, n, generator=draw, dtype=torch.float64) for n in (1, 2))

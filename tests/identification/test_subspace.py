@@ -39,7 +39,6 @@ def tank(rows: int, hold: int, seed: int, start: float = 0.0, noise: float = 0.0
 
 
 def arm(rows: int, seed: int, sweep: bool) -> dict:
-    """Return the log of two lightly damped modes, in a sweep or in steps."""
     rng, t = np.random.default_rng(seed), np.arange(rows)
     u = np.sin(2 * np.pi * (0.003 * t + 0.1 / rows * t * t))
     if not sweep:
@@ -89,7 +88,6 @@ def loaded(seed: int, pole: float, walk: float, rows: int = 1500) -> dict[str, n
 
 
 def gain(model: Innovations) -> np.ndarray:
-    """Return the steady gain."""
     return model.C @ np.linalg.solve(np.eye(len(model.A)) - model.A, model.B)
 
 

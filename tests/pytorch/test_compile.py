@@ -29,7 +29,6 @@ def functions(mpc: QPMPC) -> dict[str, Function]:
 
 
 def outcome(mpc: QPMPC, function: Function, s: Tensor, a: Tensor) -> tuple[Tensor, list]:
-    """Return a function's result and the gradient of its square in theta."""
     mpc.zero_grad()
     out = function(s, a)
     out.square().sum().backward()

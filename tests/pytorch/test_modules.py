@@ -33,7 +33,6 @@ def known(mpc: QPMPC) -> Tensor:
 
 
 def outcome(mpc: QPMPC, s: Tensor, a: Tensor) -> list[Tensor]:
-    """Return V, Q, pi, sigma, and the gradients of V and Q in theta."""
     mpc.zero_grad()
     solution = mpc.solve(s)
     out = [mpc.value(s), mpc.action_value(s, a), mpc.policy(s), solution.sigma]

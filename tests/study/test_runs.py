@@ -86,7 +86,6 @@ def test_an_ablation_is_labelled_by_its_name(study, tmp_path):
 
 @pytest.fixture(scope="module")
 def gated(tmp_path_factory):
-    """Train a run whose learned policy is in best.pt."""
     folder = tmp_path_factory.mktemp("gated")
     more = ("gate=true", "constraint=mpc")
     train.train(make_config(*SMALL, *more), str(folder), quiet=True)
