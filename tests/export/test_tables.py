@@ -1,23 +1,12 @@
 """The tables: multipliers move rows and actions as they say, and bad costs are refused."""
 
-import numpy as np
 import pytest
 import torch
 
-from tests.exported import SCHEMES, random_qp
 from tests.problems import drawn_mpc
 from tests.refused import refused
 from torch_qpmpc import QPError
 from torch_qpmpc.export.tables import make_tables
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_rows_have_unit_norm_and_depend_on_the_variables_only(seed):
-    tables = make_tables(random_qp(seed))
-    np.testing.assert_allclose(np.diag(tables.Q), 1, rtol=1e-12)
-    np.testing.assert_allclose(tables.Q, tables.R @ tables.R.T, atol=1e-12)
-    assert (tables.rows.lower <= tables.rows.upper).all()
-    assert (tables.rows.w > 0).all()
 
 
 def test_a_cost_that_is_singular_on_the_plan_is_refused():
@@ -43,13 +32,3 @@ def test_a_theta_with_nan_or_crossed_bounds_is_refused(part, value):
     with torch.no_grad():
         getattr(mpc, part).fill_(value)
     make_tables(mpc)
-
-
-def test_the_action_bounds_are_those_of_hard_rows_with_one_action():
-    tables = make_tables(SCHEMES["rates"]())
-    np.testing.assert_array_equal(tables.u_lower, [-1])
-    np.testing.assert_array_equal(tables.u_upper, [1])
-    soft = drawn_mpc(
-        1, 1, 2, stage_weight=[1.0, 1.0], action_bounds=([-1.0], [1.0]), action_slack=2.0
-    )
-    np.testing.assert_array_equal(make_tables(soft).u_upper, [np.inf])
