@@ -4,13 +4,11 @@ import sys
 
 import numba
 import numpy as np
-import pytest
 
 from tests.problems import normal
 from torch_qpmpc.qp.kernels import linalg
 from torch_qpmpc.qp.kernels.linalg import products
 
-RNG = np.random.default_rng(0)
 #: The spans of more than one matrix.
 NONE = np.zeros((0, 2), np.int64)
 
@@ -78,25 +76,6 @@ def test_more_than_one_thread_would_take_is_multiplied_in_parts():
 
 
 # For each theta
-
-
-@pytest.mark.parametrize("threshold", [0.3, 0.0])
-@pytest.mark.parametrize("width", [1, 4, 12])
-def test_a_band_is_eliminated(width, threshold):
-    """The band of each row begins at its own variable, which pivoting need not choose."""
-    n_c, n_z = 20, 34
-    C = np.triu(np.tril(RNG.normal(size=(2, n_c, n_z)), 2 + width), 2)
-    T, factors, pivots, regular = linalg.eliminate(C, 2, 1e-10, threshold)
-    assert regular
-    atol = 1e-9 if threshold else 1e-5  # entries grow
-    np.testing.assert_allclose(C @ T, 0, atol=atol)
-    spans, group = linalg.row_spans(factors), np.array([1, 0, 1])
-    b, left = RNG.normal(size=(3, n_c)), RNG.normal(size=(3, n_z))
-    z = linalg.particular(factors, pivots, spans, group, b, n_z)
-    np.testing.assert_allclose(np.einsum("bij,bj->bi", C[group], z), b, atol=atol)
-    chi = linalg.multipliers(factors, pivots, spans, group, left)
-    left += np.einsum("bij,bi->bj", C[group], chi)
-    np.testing.assert_allclose(np.take_along_axis(left, pivots[group], 1), 0, atol=atol)
 
 
 class Terminal(io.StringIO):

@@ -8,19 +8,16 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal
 from torch_qpmpc import Status, solve_qp
-from torch_qpmpc.mpc.layout import banded_matrix
 from torch_qpmpc.qp.pipeline.arrays import Theta
 from torch_qpmpc.qp.pipeline.condensing import (
     PROXIMAL,
     SHIFT,
     condense,
     dual,
-    eliminate,
     sizes,
 )
 from torch_qpmpc.qp.solve import solve
 
-BATCH = 6
 # Rows of C for the problems below, with 3 of 8 entries fixed.
 INDEPENDENT = normal(3, 8)
 DEPENDENT = normal(5, 3, seed=1) @ normal(3, 8, seed=2)
@@ -81,21 +78,6 @@ def test_a_row_of_any_scale_counts():
     C, b = scale[:, None] * known.qp.C, scale * known.qp.b
     solution = solve_qp(replace(known.qp, C=C, b=b), known.fixed, solver="daqp")
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
-
-
-def test_in_the_order_of_its_rows_C_gives_the_prediction_form():
-    """x_k equals the recursion entry by entry, even for unstable models."""
-    A = torch.tensor([[2.0, 0.1], [0.0, 1.5]]).double()
-    B, horizon = torch.tensor([[0.3], [5.0]]).double(), 50
-    found = eliminate(banded_matrix(A, B, horizon)[None].numpy(), len(A), threshold=0.0)
-    T, u = torch.from_numpy(found.T[0]), normal(horizon, seed=3)
-    actions = torch.arange(len(T)) % 3 == 2
-    assert (T[actions] != 0).sum(-1).eq(1).all()
-    x = torch.tensor([1.0, -1.0]).double()
-    z = T @ torch.cat((x, u))
-    for k in range(horizon):
-        x = A @ x + B[:, 0] * u[k]
-        assert_close(z[3 * k + 3 : 3 * k + 5], x, rtol=1e-11, atol=0)
 
 
 def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
