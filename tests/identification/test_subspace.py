@@ -98,6 +98,7 @@ def test_the_steady_gain_is_the_plants_where_the_level_drifts(pole, walk, seed):
     log = loaded(seed, pole, walk)
     read = qm.read_log(log, outputs=["y1", "y2"], inputs=["u1", "u2"])
     found = qm.identify(read)
+    assert found.fit.plant is not None
     plant, C_w = found.fit.plant
     for model in (found.fit.model, plant):
         np.testing.assert_allclose(gain(model), [[1, 0.5], [0, 1]], atol=0.1)
@@ -116,6 +117,7 @@ def test_a_load_that_drifts_is_told_from_the_level_that_it_moves(seed):
         x += 0.05 * (u[-1] + load)
     fit = qm.identify({"y": np.array(y), "u": np.array(u)}).fit
     assert (fit.order, fit.drifts) == (2, 1)
+    assert fit.plant is not None
     assert pytest.approx(0.05, rel=0.02) == fit.plant[0].B
 
 

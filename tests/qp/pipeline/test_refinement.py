@@ -168,7 +168,7 @@ def test_soft_rows_that_the_equations_put_beyond_their_bounds_are_saturated(held
     C[1, :2] = C[2, 1:3] = torch.tensor([-0.5, 1.0])
     b, far = torch.tensor([side, 0, 0], dtype=torch.float64), torch.full((held,), torch.inf)
     lb, ub = (-far, bound) if side > 0 else (-bound, far)
-    f = {"ub": ub.double(), "lb": lb.double(), "w": torch.full((held,), 5.0).double()}
+    f: Any = {"ub": ub.double(), "lb": lb.double(), "w": torch.full((held,), 5.0).double()}
     qp = QuadraticProgram(H=torch.eye(4).double(), q=torch.ones(4).double(), C=C, b=b, G=G, **f)
     p, _ = Programs.of(*qp.tensors(), torch.empty(1, 0, dtype=torch.float64))
     right = solve_programs(p, "daqp")
