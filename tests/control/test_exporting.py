@@ -266,3 +266,13 @@ def test_a_loop_without_a_first_plan_is_refused(tmp_path):
         mpc = qm.LinearMPC(([[0.9]], [[B]]), 8, Q=1.0, R=0.1, **own)
         with pytest.raises(SolverError, match=text + remedy):
             qm.Controller(mpc).export_c(tmp_path)
+
+
+def test_an_absurd_known_signal_leaves_the_estimates_alone(tmp_path):
+    controller = qm.Controller(learned())
+    twin = load(controller.export_c(tmp_path).files, controller)
+    rain, price = np.zeros((2, 5, 2))
+    rain[4, 0], price[4, 1] = 1e36, 1e36
+    assert twin.step([0.0], [1.0], rain)[1] == 3
+    assert twin.step([0.0], [1.0], price)[1] != 3  # it moves no state
+    assert twin.step([0.0], [1.0], 0 * rain)[1] == 0

@@ -8,6 +8,7 @@ import pytest
 import torch_qpmpc as qm
 from tests.campaign.units import Units, drawn, judged
 from torch_qpmpc import QPError
+from torch_qpmpc.control.lowering import riccati
 from torch_qpmpc.export.tables import make_tables
 
 
@@ -98,3 +99,17 @@ def test_the_rows_of_an_export_depend_on_each_other_alike_in_any_unit(seed):
     one = Units(*(np.ones(len(unit)) for unit in units))
     Q, other = (make_tables(design.made(x).plan).Q for x in (one, units))
     assert np.abs(Q - other).max() < 1e-10
+
+
+@pytest.mark.parametrize(("x", "u"), [(1e2, (1.0, 1e3)), (1e5, (1e-2, 1e5)), (1e-3, (1.0, 1e5))])
+@pytest.mark.parametrize("R", [0.0, 1.0])
+def test_the_terminal_weight_is_the_same_in_any_unit(x, u, R):
+    found = []
+    for x_unit, u_unit in ((1.0, np.ones(2)), (x, np.array(u))):
+        model = [[1.2]], np.array([[0.3, 0.2]]) * x_unit / u_unit
+        weights = {"Q": 1 / x_unit**2, "R": R / u_unit**2, "dR": [0.1, 0.05] / u_unit**2}
+        mpc = qm.LinearMPC(model, 5, **weights, u_bounds=(-u_unit, u_unit))
+        P, size = riccati(mpc.design), np.append(x_unit, u_unit)
+        found.append(None if P is None else P * np.outer(size, size))
+    assert (found[0] is None) == (found[1] is None) == (R == 0)
+    assert R == 0 or np.allclose(*found, rtol=1e-9)

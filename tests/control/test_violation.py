@@ -78,3 +78,10 @@ def test_what_the_log_cannot_promise_is_refused(share, options, model):
 @refused((0.1, r".* and 0 errors .* Pass a model of qm.identify\(.., horizon=1"))
 def test_a_model_without_a_log_promises_nothing(share):
     made(([[0.9]], [[0.5]]), share)
+
+
+def test_c_keeps_the_same_distance(model, tmp_path):
+    controller = made(model, 0.05)
+    difference = controller.export_c(tmp_path).difference
+    assert difference is not None
+    assert difference < 1e-8

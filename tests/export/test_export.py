@@ -372,3 +372,12 @@ def test_actions_that_differ_at_any_state_are_refused(tmp_path, monkeypatch):
     match = r"^dtype: got 'float64', with an action off by \d\.\de-0\d of its size"
     with pytest.raises(QPError, match=match):
         export_c(tied(), tmp_path)
+
+
+@needs_compiler
+def test_the_self_test_fails_for_other_tables(tmp_path):
+    (header, source) = export_c(tied(), tmp_path).files
+    text = source.read_text()
+    start = text.index("U_OFFSET[1] =") + len("U_OFFSET[1] =\n")
+    source.write_text(f"{text[:start]}{{0.5}};{text[text.index(';', start) + 1 :]}")
+    assert read(header.parent).selftest() == 1
