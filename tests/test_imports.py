@@ -20,7 +20,7 @@ def loaded_after(code: str) -> set[str]:
     return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
 
 
-def test_a_qp_a_controller_and_the_ids_import_nothing_heavy():
+def test_a_qp_a_controller_and_the_id_import_nothing_heavy():
     code = (
         "import gymnasium, torch, torch_qpmpc\n"
         "from torch_qpmpc import QPMPC, solve_qp\n"
@@ -44,9 +44,9 @@ def test_every_public_name_is_there_and_listed():
         torch_qpmpc.QPMCP  # noqa: B018 # pyright: ignore[reportAttributeAccessIssue] - misspelt
 
 
-def test_gymnasium_has_the_ids():
+def test_gymnasium_has_the_id():
     registered = [name for name in gymnasium.registry if name.startswith("torch_qpmpc/")]
-    assert registered == [f"torch_qpmpc/{name}-v0" for name in ("PointMass", "GrosZanonLTI")]
+    assert registered == ["torch_qpmpc/PointMass-v0"]
 
 
 def test_errors_are_caught_as_the_builtin_ones():

@@ -30,13 +30,10 @@ def __dir__() -> list[str]:
     return sorted({*_LAZY, "__version__"})
 
 
-#: Module and length of an episode of each environment.
-_ENVIRONMENTS = {"PointMass": ("point_mass", 50), "GrosZanonLTI": ("gros_zanon", 5000)}
-for _name, (_module, _steps) in _ENVIRONMENTS.items():
-    # Registering an id twice warns, and a reload or a spawned worker imports this again.
-    if f"torch_qpmpc/{_name}-v0" not in gymnasium.registry:
-        gymnasium.register(
-            id=f"torch_qpmpc/{_name}-v0",
-            entry_point=f"torch_qpmpc.envs.{_module}:{_name}GymEnv",
-            max_episode_steps=_steps,
-        )
+# Registering an id twice warns, and a reload or a spawned worker imports this again.
+if "torch_qpmpc/PointMass-v0" not in gymnasium.registry:
+    gymnasium.register(
+        id="torch_qpmpc/PointMass-v0",
+        entry_point="torch_qpmpc.envs.point_mass:PointMassGymEnv",
+        max_episode_steps=50,
+    )

@@ -1,8 +1,8 @@
-"""Plants and environments; Gymnasium has them as ``torch_qpmpc/PointMass-v0`` and the like."""
+"""Plants and environments; Gymnasium has the point mass as ``torch_qpmpc/PointMass-v0``."""
 
 from __future__ import annotations
 
-from torch_qpmpc.envs.gros_zanon import GrosZanonLTI, GrosZanonLTIGymEnv
+from torch_qpmpc.envs.gros_zanon import GrosZanonLTI
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.kalman_filter import KalmanFilter
 from torch_qpmpc.envs.linear_system import LinearSystem, LinearSystemEnv, LinearSystemGymEnv
@@ -11,7 +11,6 @@ from torch_qpmpc.envs.point_mass import PointMass, PointMassGymEnv
 
 __all__ = [
     "GrosZanonLTI",
-    "GrosZanonLTIGymEnv",
     "GymnasiumPlant",
     "KalmanFilter",
     "LinearSystem",

@@ -1,4 +1,4 @@
-"""Gros and Zanon's linear system, with its Gymnasium environment.
+"""Gros and Zanon's linear system.
 
     s+ = A s + B a + [e, 0],    e uniform in (-0.1, 0),    s_0 = [0, 0.15]
 
@@ -15,13 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_qpmpc.checks import NONNEGATIVE, check_number, check_tensor
-from torch_qpmpc.envs.linear_system import (
-    LinearSystem,
-    LinearSystemGymEnv,
-    Rng,
-    float64,
-    uniform,
-)
+from torch_qpmpc.envs.linear_system import LinearSystem, Rng, float64, uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +79,3 @@ class GrosZanonLTI(LinearSystem):
         """Return the model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
         as_A = self.A.new_tensor
         return as_A([[1, 0.25], [0, 1]]), as_A([[0.0312], [0.25]])
-
-
-class GrosZanonLTIGymEnv(LinearSystemGymEnv):
-    """``torch_qpmpc/GrosZanonLTI-v0``, which never terminates and is truncated at 5000 steps."""
-
-    def __init__(self, plant: GrosZanonLTI | None = None) -> None:
-        super().__init__(GrosZanonLTI() if plant is None else plant)
