@@ -52,7 +52,6 @@ TD = partial(TensorDict, batch_size=4)
 op, gn = make_operator(), qm.GaussNewton(random_mpc(0))
 deviation, si = qm.DeviationPenalty(mpc), qm.SystemIdentificationPenalty()
 form = prediction_form(banded_matrix(A2, B1, 4), 2, 1)
-pair = prediction_form(torch.stack([mpc.C_0] * 2), 2, 1)
 model, pm = nearest_model(form), PointMass()
 pendulum, episode = GymnasiumPlant("Pendulum-v1"), PointMassGymEnv()
 episode.reset(seed=0)
@@ -152,9 +151,8 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("windows: got shape (11, 6), expected shape (M, 11).", lambda: si(zeros(5, 11), mpc.C.mT)),
     ("C: got QPMPC, expected a floating-point torch.Tensor.", lambda: si(mpc, zeros(1, 11))),
     # Analysis
-    ("C: got shape (11,), expected shape (*batch, N", lambda: prediction_form(zeros(11), 2, 1)),
+    ("C: got shape (11,), expected shape (N n_x, n_z)", lambda: prediction_form(zeros(11), 2, 1)),
     ("form: got Parameter, expected a PredictionForm.", lambda: canonical_matrix(mpc.C)),
-    ("form.Phi: got shape (2, 6, 2), expected", lambda: canonical_matrix(pair)),
     ("mpc: got Tensor, expected a QPMPC.", lambda: read(mpc.C_0)),
     ("true_model: got tuple of 1, expected the pair (A, B), (A, B,", lambda: read(mpc, (A2,))),
     ("mpc: got QPActorValueOperator, expected a QPMPC.", lambda: structure_metrics(op)),

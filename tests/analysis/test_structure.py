@@ -65,13 +65,6 @@ def test_defects_are_sums_over_blocks():
     assert above > 0.01 * total
 
 
-def test_defects_of_a_batch():
-    forms = [free_form(seed) for seed in (0, 1)]
-    C = torch.stack([canonical_matrix(form)[0] for form in forms])
-    for defect in (causality_defect, toeplitz_defect):
-        torch.testing.assert_close(defect(form_of(C)), torch.stack([defect(f) for f in forms]))
-
-
 def test_a_time_varying_scheme_is_markovian_but_no_tied_one():
     A_k, B_k = A + 0.1 * normal(N, N_X, N_X, seed=3), B + 0.1 * normal(N, N_X, N_U, seed=4)
     c_k = normal(N, N_X, seed=5)

@@ -40,10 +40,10 @@ class PredictionForm:
     """X = Phi p + Gamma U + phi, in float64.
 
     Attributes:
-        Phi: ``(*batch, N n_x, n_p)``.
-        Gamma: ``(*batch, N n_x, N n_u)``; block (k, j) is the effect of u_j on x_{k+1}.
-        phi: the offset, ``(*batch, N n_x)``; zero if b is.
-        condition: condition number of C's state columns, ``(*batch,)``; depends on the gauge.
+        Phi: ``(N n_x, n_p)``.
+        Gamma: ``(N n_x, N n_u)``; block (k, j) is the effect of u_j on x_{k+1}.
+        phi: the offset, ``(N n_x,)``; zero if b is.
+        condition: condition number of C's state columns, ``()``; depends on the gauge.
         layout: the sizes of z.
     """
 
@@ -55,30 +55,20 @@ class PredictionForm:
 
     @property
     def blocks(self) -> Tensor:
-        """Gamma by blocks, ``(*batch, N, N, n_x, n_u)``: [k, j] is the effect of u_j on x_{k+1}."""
-        N = self.layout.horizon
-        rows = self.Gamma.unflatten(-1, (N, self.layout.n_u))
-        rows = rows.unflatten(-3, (N, self.layout.n_x))
-        return rows.movedim(-2, -3)
+        """Gamma by blocks, ``(N, N, n_x, n_u)``: [k, j] is the effect of u_j on x_{k+1}."""
+        N, n_x, n_u = self.layout.horizon, self.layout.n_x, self.layout.n_u
+        return self.Gamma.view(N, n_x, N, n_u).transpose(1, 2)
 
     @property
     def maps(self) -> Tensor:
-        """The states x_0, .., x_N as linear maps of (p, U, 1), ``(*batch, N + 1, n_x, n_v)``.
+        """The states x_0, .., x_N as linear maps of (p, U, 1), ``(N + 1, n_x, n_v)``.
 
         n_v is n_p + N n_u + 1.
         """
         following = torch.cat((self.Phi, self.Gamma, self.phi.unsqueeze(-1)), dim=-1)
         n_x, n_p = self.layout.n_x, self.layout.n_p
         first = torch.eye(n_p, following.shape[-1])[-n_x:].to(following)
-        stages = following.unflatten(-2, (self.layout.horizon, n_x))
-        return torch.cat((first.expand(*stages.shape[:-3], 1, -1, -1), stages), dim=-3)
-
-
-def _check_form(form: PredictionForm) -> None:
-    """Raise `QPError` unless ``form`` is a prediction form without batch dimensions."""
-    check_kind("form", form, PredictionForm, FORM_REMEDY)
-    remedy = "Pass the form of a single C."
-    check_tensor("form.Phi", form.Phi, "N n_x", "n_p", batched=False, remedy=remedy)
+        return torch.cat((first, following)).unflatten(0, (-1, n_x))
 
 
 @without_gradients
@@ -88,9 +78,9 @@ def prediction_form(
     """Solve ``C z = b`` for x_1, .., x_N.
 
     Args:
-        C: ``(*batch, N n_x, n_z)``.
+        C: ``(N n_x, n_z)``.
         n_x, n_u, n_d: numbers of states, actions and entries of d_k, as in `QPMPC`.
-        b: ``(*batch, N n_x)``; zero by default.
+        b: ``(N n_x,)``; zero by default.
 
     Raises:
         QPError: if the shapes do not fit, or C's state columns are singular, so that p and the
@@ -107,23 +97,23 @@ def prediction_form(
                 [0.5000, 1.0000, 0.0000],
                 [0.2500, 0.5000, 1.0000]], dtype=torch.float64)
     """
-    check_tensor("C", C, "N n_x", "n_z", remedy="Pass mpc.C.")
-    n_c, n_z = C.shape[-2:]
+    check_tensor("C", C, "N n_x", "n_z", batched=False, remedy="Pass mpc.C.")
+    n_c, n_z = C.shape
     N = n_c // max(n_x, 1)
     layout = Layout(n_x, n_u, max(N, 1), n_d)
     if N < 1 or n_c != N * n_x or n_z != layout.n_z:
-        want = f"(*batch, N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
+        want = f"(N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")
-    b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c)
+    b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c, batched=False)
     C, b = (x.to("cpu", torch.float64) for x in (C, b))
     if not (C.isfinite().all() and b.isfinite().all()):
         raise QPError.expected("C, b", "NaN or inf", "finite entries")
     # Rows of unit norm, so that their scale does not affect the condition number.
     size = C.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(C.dtype).tiny)
     C, b = C / size, b.unsqueeze(-1) / size
-    following, p, u = (C[..., columns] for columns in _columns(layout))
+    following, p, u = (C[:, columns] for columns in _columns(layout))
     condition = _condition(following)
-    solved = torch.linalg.solve(following, torch.cat((-p, -u, b.expand(*p.shape[:-1], 1)), -1))
+    solved = torch.linalg.solve(following, torch.cat((-p, -u, b), -1))
     Phi, Gamma, phi = solved.split((layout.n_p, N * n_u, 1), dim=-1)
     return PredictionForm(Phi, Gamma, phi.squeeze(-1), condition, layout)
 
@@ -166,15 +156,13 @@ def _columns(layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _condition(following: Tensor) -> Tensor:
-    """Return the condition number of ``(*batch, n_c, n_c)``; raise `QPError` if it is too large."""
+    """Return the condition number of ``(n_c, n_c)``; raise `QPError` if it is too large."""
     values = torch.linalg.svdvals(following)
-    condition = values[..., 0] / values[..., -1]
+    condition = values[0] / values[-1]
     # Written so that nan, from 0 / 0, is rejected, too.
-    if not (condition <= LARGEST_CONDITION).all():
-        worst = values.reshape(-1, values.shape[-1])[values[..., -1].argmin()]
-        rank = int((worst > worst[0] / LARGEST_CONDITION).sum())
-        got = f"state columns of rank {rank} of {len(worst)}"
-        got += f" (condition number {worst[0] / worst[-1]:.2g})"
+    if not condition <= LARGEST_CONDITION:
+        rank = int((values > values[0] / LARGEST_CONDITION).sum())
+        got = f"state columns of rank {rank} of {len(values)} (condition number {condition:.2g})"
         remedy = (
             "The constraints do not determine x_1, .., x_N from what is known and the actions, so "
             "they have no prediction form. Penalise the deviation from C_0, or learn C at a "
@@ -186,17 +174,17 @@ def _condition(following: Tensor) -> Tensor:
 
 
 def causality_defect(form: PredictionForm) -> Tensor:
-    """Return ``||Gamma above its block diagonal|| / ||Gamma||``, ``(*batch,)``.
+    """Return ``||Gamma above its block diagonal|| / ||Gamma||``, ``()``.
 
     It is zero if no u_j enters an x_k with k <= j, and at most 1.
     """
     check_kind("form", form, PredictionForm, FORM_REMEDY)
     squares = form.blocks.square().sum((-1, -2))
-    return (squares.triu(1).sum((-1, -2)) / squares.sum((-1, -2))).sqrt()
+    return (squares.triu(1).sum() / squares.sum()).sqrt()
 
 
 def toeplitz_defect(form: PredictionForm) -> Tensor:
-    """Return ``||Gamma - its nearest block Toeplitz matrix|| / ||Gamma||``, ``(*batch,)``.
+    """Return ``||Gamma - its nearest block Toeplitz matrix|| / ||Gamma||``, ``()``.
 
     It is zero if an action's effect depends on its lag alone, as in a time-invariant scheme.
     """
@@ -204,10 +192,9 @@ def toeplitz_defect(form: PredictionForm) -> Tensor:
     N, blocks = form.layout.horizon, form.blocks
     means = torch.zeros_like(blocks)
     for lag in range(1 - N, N):
-        diagonal = means.diagonal(offset=-lag, dim1=-4, dim2=-3)
-        diagonal += blocks.diagonal(offset=-lag, dim1=-4, dim2=-3).mean(-1, keepdim=True)
-    every = (-1, -2, -3, -4)
-    return ((blocks - means).square().sum(every) / blocks.square().sum(every)).sqrt()
+        diagonal = means.diagonal(offset=-lag)
+        diagonal += blocks.diagonal(offset=-lag).mean(-1, keepdim=True)
+    return ((blocks - means).square().sum() / blocks.square().sum()).sqrt()
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +222,7 @@ def stage_models(form: PredictionForm) -> NearestModel:
     u_k, d_k and a constant, zero in directions that no prediction of x_k reaches. The residual
     is the part of x_{k+1} from earlier pairs or later actions: zero in all stages means Markovian.
     """
-    _check_form(form)
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
     maps, pairs = form.maps, _pairs(form)
     fit = _fit(pairs, maps[1:])
     left = maps[1:] - fit @ pairs
@@ -250,7 +237,7 @@ def nearest_model(form: PredictionForm) -> NearestModel:
     Gamma, phi](A, B, E, offset)||``; the residual is that over ``||[Phi, Gamma]||``, of a local
     minimum: an upper bound on the distance to the MPC schemes.
     """
-    _check_form(form)
+    check_kind("form", form, PredictionForm, FORM_REMEDY)
     maps, pairs = form.maps, _pairs(form)
     n_x, n_v = maps.shape[-2:]
     pooled = pairs.movedim(0, 1).flatten(1)
