@@ -192,13 +192,6 @@ def test_gauss_newton_takes_no_upstream_modules():
             second_order(mpc, loss, GaussNewton(mpc), Penalties())
 
 
-def test_the_network_reads_other_keys():
-    mpc, *_ = scheduled()
-    theta = ThetaNetwork(mpc, {"q": 0.5}, in_keys=["wind", ("nested", "load")], n_in=3)
-    td = TensorDict(wind=torch.ones(3, 2), nested=TensorDict(load=torch.ones(3, 1)), batch_size=3)
-    assert theta(td)["theta", "q"].shape == (3, mpc.n_z)
-
-
 @refused(
     (lambda mpc: ThetaNetwork(torch.nn.Linear(1, 1), {"q": 1.0}), "mpc: got Linear"),
     (lambda mpc: ThetaNetwork(mpc, ["q"]), "sizes: got list, expected a Mapping. Map names"),
@@ -206,19 +199,13 @@ def test_the_network_reads_other_keys():
     (lambda mpc: ThetaNetwork(mpc, {"A": 1.0}), "sizes: got 'A', expected names among H, q"),
     (lambda mpc: ThetaNetwork(mpc, {"q": 0.0}), r"sizes\['q'\]: got 0.0, expected a f"),
     (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, width=0), "width: got 0"),
-    (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, n_in=0), "n_in: got 0, expected a whole"),
-    (
-        lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys="observation"),
-        r"in_keys: got 'observation', expected a list of keys, such as \['observation'\]",
-    ),
-    (lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=[]), r"in_keys: got \[\], expected a l"),
     (
         lambda mpc: ThetaNetwork(mpc, {"q": 1.0})(TensorDict(observation=torch.ones(3, 5))),
-        r"in_keys: got 5 entries of observation, expected n_in = 2. Pass n_in=5, or other",
+        r"p: got shape \(3, 5\), expected shape \(\*batch, 2\)",
     ),
     (
-        lambda mpc: ThetaNetwork(mpc, {"q": 1.0}, in_keys=["wind"], n_in=2)(transitions(mpc)),
-        "wind: got a TensorDict with .*, expected one with wind. Rename the module's keys",
+        lambda mpc: ThetaNetwork(mpc, {"q": 1.0})(transitions(mpc).exclude("observation")),
+        "observation: got a TensorDict with .*, expected one with observation. Rename the module's",
     ),
     (
         lambda mpc: QPActorValueOperator(mpc, theta_keys={"w": "w"}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.modules import MLP
 
-from torch_qpmpc.checks import POSITIVE, check_kind, check_number, check_whole
+from torch_qpmpc.checks import POSITIVE, check_kind, check_number, check_tensor, check_whole
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.learning.operators import PREVIEW, entry
 from torch_qpmpc.mpc.module import QPMPC
@@ -31,8 +31,6 @@ class ThetaNetwork(TensorDictModuleBase):
             ``{"q": 1.0, "b": 0.1}``. Residuals of vectors (q, c, b, lb, ub) are cheap. Those of
             matrices (H, H_f, C, G) need one factorisation per QP: ten times as long or longer.
         width: units in each of the two hidden layers.
-        in_keys: the keys of the inputs, which are concatenated; by default the keys of p.
-        n_in: the number of their entries; by default n_p.
 
     Attributes:
         theta_keys: the key of each residual, an argument of `QPActorValueOperator`.
@@ -54,21 +52,11 @@ class ThetaNetwork(TensorDictModuleBase):
         torch.Size([3, 1])
     """
 
-    def __init__(
-        self,
-        mpc: QPMPC,
-        sizes: Mapping[str, float],
-        *,
-        width: int = 64,
-        in_keys: Sequence[NestedKey] | None = None,
-        n_in: int | None = None,
-    ) -> None:
+    def __init__(self, mpc: QPMPC, sizes: Mapping[str, float], *, width: int = 64) -> None:
         super().__init__()
         check_kind("mpc", mpc, QPMPC)
         check_kind("sizes", sizes, Mapping, "Map names to bounds: {'q': 1.0}.")
         check_whole("width", width, 1)
-        if n_in is not None:
-            check_whole("n_in", n_in, 1)
         known = mpc.coordinates()
         check_names("sizes", sizes, mpc)
         if not sizes:
@@ -78,15 +66,11 @@ class ThetaNetwork(TensorDictModuleBase):
         self.sizes = {name: float(size) for name, size in sizes.items()}
         self.shapes = {name: known[name].shape for name in sizes}
         self.theta_keys: dict[str, NestedKey] = {name: ("theta", name) for name in sizes}
-        keys = (*[PREVIEW] * (mpc.n_d > 0), "observation") if in_keys is None else in_keys
-        if not isinstance(keys, Sequence) or isinstance(keys, str) or not keys:
-            raise QPError.expected("in_keys", repr(keys), "a list of keys, such as ['observation']")
-        self.in_keys = list(keys)  # pyright: ignore[reportAttributeAccessIssue]
+        self.in_keys = [*[PREVIEW] * (mpc.n_d > 0), "observation"]  # pyright: ignore[reportAttributeAccessIssue]
         self.out_keys = list(self.theta_keys.values())  # pyright: ignore[reportAttributeAccessIssue]
         n_out, device = sum(shape.numel() for shape in self.shapes.values()), mpc.C_0.device
         cells, options = [width, width], {"activation_class": nn.Tanh, "device": device}
-        n_in = mpc.n_p if n_in is None else n_in
-        self.net = MLP(n_in, n_out, num_cells=cells, **options)
+        self.net = MLP(mpc.n_p, n_out, num_cells=cells, **options)
         last: Any = self.net[-1]
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
@@ -96,15 +80,12 @@ class ThetaNetwork(TensorDictModuleBase):
         """Write the residuals to ``theta_keys`` of ``tensordict``, and return it.
 
         Raises:
-            QPError: an input is missing, or their entries are not ``n_in``.
+            QPError: an input is missing, or their entries are not n_p.
         """
         last: Any = self.net[-1]
         parts = [entry(tensordict, key) for key in self.in_keys]
         inputs = torch.cat([part.to(last.bias.dtype) for part in parts], -1)
-        if inputs.shape[-1] != self.net.in_features:
-            got = f"{inputs.shape[-1]} entries of {', '.join(map(str, self.in_keys))}"
-            remedy = f"Pass n_in={inputs.shape[-1]}, or other in_keys."
-            raise QPError.expected("in_keys", got, f"n_in = {self.net.in_features}", remedy)
+        check_tensor("p", inputs, self.net.in_features)
         counts = [shape.numel() for shape in self.shapes.values()]
         flat = self.net(inputs).tanh().split(counts, -1)
         for (name, shape), entries in zip(self.shapes.items(), flat, strict=True):
