@@ -12,7 +12,6 @@ from tests.problems import model_form, normal
 from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.structure import (
     PredictionForm,
-    canonical_matrix,
     causality_defect,
     nearest_model,
     prediction_form,
