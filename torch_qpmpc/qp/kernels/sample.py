@@ -251,10 +251,7 @@ def judge(z, lam, chi, group, fixed, qps, terms):
             if split < gap + of_slope:
                 gap, of_slope = 0.0, split
         rows = (y[i], lam[i], lb_i, ub_i, w_i, steps)
-        if sizes.apart:
-            step = _repair_apart(rows, hard, z[i], G_m)
-        else:
-            step = _repair(rows, hard, z[i], G_m, sizes.units[m], basis, ends, slacks)
+        step = _repair(rows, hard, z[i], G_m, sizes.units[m], basis, ends, slacks)
         off = gap + of_slope + ROUNDING * noise + (steep + 0.5 * sizes.stiffness[m] * step) * step
         off += _kinks(y[i], lb_i, ub_i, w_i, steps, step)
         # Sums propagate a NaN in any entry; maxima ignore it.
@@ -362,18 +359,6 @@ def _split_fall(slope, lb, ub, w, far, inverse, H, steps, box):
         total += 0.5 * u[a] * (slope[a] - rest[a])
         total += (abs(rest[a]) + ROUNDING * _weighted(u, H[a])) * reach
     return total
-
-
-@compiled
-def _repair_apart(rows, hard, z, G):
-    """Return the length of `_repair`'s step if the hard rows' normals are nearly orthogonal."""
-    y, lam, lb, ub, w, steps = rows
-    total = 0.0
-    for j in hard:
-        over = max(y[j] - ub[j], lb[j] - y[j])
-        if (over > 0 or lam[j] != 0) and w[j] == np.inf and steps[j] > 0:
-            total += ((max(over, 0.0) + ROUNDING * _weighted(z, G[j])) / steps[j]) ** 2
-    return math.sqrt(total)
 
 
 @compiled

@@ -118,7 +118,6 @@ class Sizes(NamedTuple):
         box: the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one.
         bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
         units: the hard rows in v, of unit length, ``(M, h, d)``.
-        apart: True if each subset of these rows is well conditioned.
         spans: those of `Condensed`.
     """
 
@@ -133,7 +132,6 @@ class Sizes(NamedTuple):
     box: Array
     bounds: Array
     units: Array
-    apart: bool
     spans: tuple[Array, ...]
 
 
@@ -220,11 +218,9 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     hard = np.flatnonzero(np.isinf(theta.w).any(0) & (steps > 0).any(0))
     # Contiguous whatever the indices, or the kernels would be compiled for each layout.
     units = np.ascontiguousarray(G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None])
-    cosines = kernels.row_sums(units @ units.swapaxes(1, 2)) - (steps[:, hard] > 0)
-    apart = bool((cosines < 0.5).all())
     inverse, shift = inverse_factors(H)
     stiffness = kernels.row_sums(H).max(-1, initial=0.0)
-    rows = steps, hard, box, bounds, units, apart
+    rows = steps, hard, box, bounds, units
     return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, condensed.spans)
 
 
