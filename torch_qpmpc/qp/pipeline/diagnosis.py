@@ -15,8 +15,6 @@ elimination is ill-conditioned.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 
@@ -38,32 +36,26 @@ def diagnose(programs: Programs) -> np.ndarray:
         qp = qp._replace(H=np.pad(free, (n_f, 0)), q=q)  # in the rest of z, the fixed are linear
         if m not in ranges:
             T, Y, *_ = null_space(qp.C[None], 0)
-            ranges[m] = _Range(Y[0], T[0])
-        statuses.append(int(_status(qp, ranges[m])))
+            ranges[m] = Y[0], T[0]
+        statuses.append(int(_status(qp, *ranges[m])))
     return np.array(statuses, np.int64)
 
 
-class _Range(NamedTuple):
-    """The pseudo-inverse of C ``(n_z, n_c)``, and its orthonormal null space ``(n_z, d)``."""
-
-    inverse: np.ndarray
-    null: np.ndarray
-
-
-def _status(qp: Theta, C_range: _Range) -> Status:
-    z = C_range.inverse @ qp.b
-    z = z + C_range.inverse @ (qp.b - qp.C @ z)
-    if _contradict(qp, qp.C @ z - qp.b, np.zeros(len(qp.w)), z, C_range):
+def _status(qp: Theta, inverse: np.ndarray, null: np.ndarray) -> Status:
+    """Return a status by C's pseudo-inverse ``(n_z, n_c)`` and null space ``(n_z, d)``."""
+    z = inverse @ qp.b
+    z = z + inverse @ (qp.b - qp.C @ z)
+    if _contradict(qp, qp.C @ z - qp.b, np.zeros(len(qp.w)), z, inverse):
         return Status.INFEASIBLE
-    nearest, lam = _nearest_feasible(qp, z, C_range)
-    if _contradict(qp, np.zeros(len(qp.b)), lam, z, C_range):
+    nearest, lam = _nearest_feasible(qp, z, null)
+    if _contradict(qp, np.zeros(len(qp.b)), lam, z, inverse):
         return Status.INFEASIBLE
-    if _is_feasible(qp, nearest) and _falls(qp, _steepest_recession(qp, C_range)):
+    if _is_feasible(qp, nearest) and _falls(qp, _steepest_recession(qp, null)):
         return Status.UNBOUNDED
     return Status.NOT_CONVERGED
 
 
-def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_feasible(qp: Theta, z: np.ndarray, null: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the feasible point nearest to z, where C z = b, and multipliers against feasibility.
 
     This is Lawson and Hanson's least distance programming: for rows ``A v >= h``, the residual of
@@ -75,7 +67,7 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
         return z, lam
     norms = np.linalg.norm(qp.G[hard], axis=1)
     norms[norms == 0] = 1.0
-    A = _product(qp.G[hard], C_range.null) / norms[:, None]
+    A = _product(qp.G[hard], null) / norms[:, None]
     lower, upper = lower / norms, upper / norms
     length = max(lower.max(), -upper.min())
     # Bounds that are far away would only spoil the least squares.
@@ -91,7 +83,7 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
     weights[weights < ROUNDING * weights.max()] = 0.0
     residual = E @ weights - unit
     if residual[-1] < 0:
-        z = z + C_range.null @ (residual[:-1] / -residual[-1]) * length
+        z = z + null @ (residual[:-1] / -residual[-1]) * length
     multipliers = np.zeros(len(norms))
     multipliers[above] = weights[below.sum() :]
     multipliers[below] -= weights[: below.sum()]
@@ -100,7 +92,7 @@ def _nearest_feasible(qp: Theta, z: np.ndarray, C_range: _Range) -> tuple[np.nda
 
 
 def _contradict(
-    qp: Theta, chi: np.ndarray, lam: np.ndarray, z: np.ndarray, C_range: _Range
+    qp: Theta, chi: np.ndarray, lam: np.ndarray, z: np.ndarray, inverse: np.ndarray
 ) -> bool:
     """True if chi, completed to ``C'chi + G'lam = 0``, and lam prove that no z is feasible.
 
@@ -109,7 +101,7 @@ def _contradict(
     """
     G_lam = qp.G.T @ lam
     for _ in range(3):
-        chi = chi - C_range.inverse.T @ (qp.C.T @ chi + G_lam)
+        chi = chi - inverse.T @ (qp.C.T @ chi + G_lam)
     largest = max(np.abs(chi).max(initial=0.0), np.abs(lam).max(initial=0.0))
     chi = _without_noise(chi, largest)
     size = np.abs(chi)
@@ -150,14 +142,14 @@ def _is_feasible(qp: Theta, z: np.ndarray) -> bool:
     return bool((errors <= TOLERANCE * (1 + np.concatenate(terms))).all())
 
 
-def _steepest_recession(qp: Theta, C_range: _Range) -> np.ndarray:
+def _steepest_recession(qp: Theta, null: np.ndarray) -> np.ndarray:
     """Return the direction in which the cost of an unbounded QP decreases fastest.
 
     It is the residual of the multipliers that best balance the slope; zero if they balance it.
     """
-    curvatures, basis = np.linalg.eigh(C_range.null.T @ qp.H @ C_range.null)
+    curvatures, basis = np.linalg.eigh(null.T @ qp.H @ null)
     flat = np.abs(curvatures) <= ROUNDING * np.abs(curvatures).max(initial=0.0)
-    F = C_range.null @ basis[:, flat]
+    F = null @ basis[:, flat]
     slope = F.T @ qp.q
     scale = np.abs(slope).max(initial=0.0)
     if not scale > 0:

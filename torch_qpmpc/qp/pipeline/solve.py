@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.qp.batching import flatten_batch
-from torch_qpmpc.qp.pipeline.arrays import LONG, BatchSolution, SoftQPs
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs
 from torch_qpmpc.qp.pipeline.batch import Prepared, Programs, prepared_for
 from torch_qpmpc.qp.pipeline.condensing import OTHER_ELIMINATIONS
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
@@ -309,10 +309,7 @@ def backed(solve: Backend, passes: int = 0) -> Step:
     def step(programs: Programs, _: Any) -> BatchSolution:
         qps = programs.reduced_qps()
         run = solve if qps.l.shape[-1] else _unconstrained
-        steepest = np.abs(qps.g).max(initial=0.0)
-        flattest = np.abs(qps.H).max((1, 2), initial=0.0).min()
-        answer = run(qps) if steepest <= LONG * flattest else qps.in_own_units(run)
-        return programs.recover(answer, passes)
+        return programs.recover(qps.in_own_units(run), passes)
 
     return step
 
