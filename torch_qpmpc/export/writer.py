@@ -199,16 +199,10 @@ def array(name: str, x: Array, dtype: str) -> str:
     shape = "".join(f"[{n}]" for n in x.shape)
     rows = x if x.ndim == 2 else x[None]
     edges: Any = {"initial_indent": "{", "subsequent_indent": " ", "break_on_hyphens": False}
-    body = "},\n".join(fill(", ".join(numbers(row, dtype)), WIDTH, **edges) for row in rows) + "}"
+    texts = (", ".join(number(v, dtype) for v in row) for row in rows)
+    body = "},\n".join(fill(text, WIDTH, **edges) for text in texts) + "}"
     body = f"{{\n{body}}}" if x.ndim == 2 else body
     return f"static const real {name}{shape} =\n{body};"
-
-
-def numbers(x: Array, dtype: str) -> list[str]:
-    """Return the `number` of each entry of a row."""
-    if dtype == "float64" and np.abs(x).max() < float(CONSTANTS[dtype]["BIG"]):
-        return list(map(repr, x.tolist()))  # in a fifth of the time
-    return [number(v, dtype) for v in x]
 
 
 def number(x: float, dtype: str) -> str:

@@ -205,11 +205,6 @@ class Gate:
         self._pairs, self._alpha, self._patience, self._seed = pairs, alpha, patience, seed
         self.accepted = self.rejected = self._in_a_row = 0
 
-    def _test(self) -> PairedTest:
-        """Return the test of the next comparison, with its share of alpha."""
-        k = self._decisions + self.accepted + self.rejected
-        return PairedTest(self._alpha * self._decisions / (k * (k + 1)), self._bound)
-
     @torch.no_grad()
     def judge(self, candidate: nn.Module) -> PairedTest:
         """Compare ``candidate`` with the policy that is kept, on new starts and disturbances.
@@ -233,7 +228,8 @@ class Gate:
         return test
 
     def _compare(self, candidate: nn.Module) -> PairedTest:
-        test, count = self._test(), 0
+        k, count = self._decisions + self.accepted + self.rejected, 0
+        test = PairedTest(self._alpha * self._decisions / (k * (k + 1)), self._bound)
         # A candidate that costs as much or more so far is hardly worth more pairs.
         while test.decision == "open" and test.pairs < self._pairs and not test.mean >= 0:
             entropy = [self._seed, self.accepted + self.rejected, count]

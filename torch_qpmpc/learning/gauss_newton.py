@@ -1,10 +1,6 @@
 """Second-order Q-learning: a Levenberg-Marquardt step on a batch of TD errors.
 
-With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, the step solves
-
-    min over dtheta:  1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
-
-by its dual; `learning.kernel` has that and D.
+`torch_qpmpc.learning.kernel` has its program, the metric D on theta, and the dual that solves it.
 """
 
 from __future__ import annotations
@@ -234,7 +230,8 @@ class GaussNewton(torch.optim.Optimizer):
         """
         s, a, root, solution = batch
         lr, before = self.param_groups[0]["lr"], objective(delta, blocks)
-        _move(blocks, steps, lr)
+        for block, step in zip(blocks, steps, strict=True):
+            block.leaf.add_(step, alpha=lr)
         proposed = lr * change
         change = self._project(blocks, proposed)
         predicted = before - objective(delta - change, blocks)
@@ -263,10 +260,7 @@ class GaussNewton(torch.optim.Optimizer):
         replaced = [x["name"] for x in groups if not own.issuperset(map(id, x["params"]))]
         if replaced:
             got = f"a QPMPC with new parameters of {', '.join(replaced)}"
-            remedy = (
-                "QPMPC.release and load_state_dict(assign=True) replace parameters: make a new "
-                "GaussNewton after them."
-            )
+            remedy = "Make a new GaussNewton after release and load_state_dict(assign=True)."
             raise QPError.expected("mpc", got, "the parameters of this optimiser", remedy)
 
     def _project(self, blocks: list[Block], change: Tensor) -> Tensor:
@@ -348,9 +342,3 @@ def _gradients(
     in_parts = [gradients[n](x.expand(len(z), *x.shape)) for n, x in parts.items()]
     options = {"is_grads_batched": True, "materialize_grads": True}
     return torch.autograd.grad(list(parts.values()), leaves, in_parts, **options)
-
-
-def _move(blocks: list[Block], steps: list[Tensor], lr: float) -> None:
-    """Add ``lr`` times its step to each parameter."""
-    for block, step in zip(blocks, steps, strict=True):
-        block.leaf.add_(step, alpha=lr)

@@ -1,6 +1,7 @@
 """The gradients of a batch in each learned part, and the kernel that they make with a metric.
 
-With g_i = dQ(s_i, a_i)/dtheta and a metric D on theta, the step that minimises
+With g_i = dQ(s_i, a_i)/dtheta by the envelope theorem and a metric D on theta, the step that
+minimises
 
     1/2 sum_i (delta_i - g_i'dtheta)^2 + 1/2 mu dtheta'D^-1 dtheta
 

@@ -13,7 +13,7 @@ from scipy.spatial import HalfspaceIntersection, QhullError
 
 from torch_qpmpc.checks import check_kind
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.validation import read_numbers
+from torch_qpmpc.mpc.validation import as_tensor
 
 Array = np.ndarray
 #: Vertices are enumerated up to this dimension, not counting entries that a box fixes.
@@ -21,10 +21,7 @@ MOST_DIMENSIONS = 8
 
 
 def _array(name: str, value: Any) -> Array:
-    numbers = read_numbers(name, value).detach().numpy().copy()
-    if not np.isfinite(numbers).all():
-        raise QPError.expected(name, "NaN or inf", "finite entries")
-    return numbers
+    return as_tensor(name, value).detach().numpy().copy()
 
 
 def positive(x: Array, otherwise: Any = 1.0) -> Array:
