@@ -58,7 +58,7 @@ def test_copies_have_the_same_fields_and_theta(copied):
     (lambda: make(gamma=0.0), r"gamma: got 0.0, expected a discount factor in \(0, 1\]"),
     (
         lambda: QPMPC(make(cost=Cost())),
-        r"stage_weight: got none, expected the weight of .* such as stage_weight=\[1.0, 1.0, 0.1\]",
+        r"stage_weight: got none, expected a weight of .* such as stage_weight=\[1.0, 1.0, 0.1\]",
     ),
     (lambda: QPMPC(make(model=Model())), r"A, B: got None, expected the model x\+ = A x \+ B u, m"),
     (lambda: make(layout=(2, 1, 4)), "layout: got tuple, expected a Layout"),

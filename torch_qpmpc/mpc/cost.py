@@ -17,6 +17,11 @@ from torch_qpmpc.mpc.riccati import RICCATI, terminal_riccati
 from torch_qpmpc.mpc.validation import check_weight, owned
 
 HESSIANS = ("diagonal", "block")
+#: What to do without a stage weight.
+REMEDY = (
+    "Pass the plant's own W (in train.py task.stage_weight) of the cost 1/2 [x; u]' W [x; u], such "
+    "as stage_weight=[1.0, 1.0, 0.1] for two states and an action."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +80,7 @@ class Cost:
         """
         stage, terminal = self.stage_weight, self.terminal_weight
         if stage is None:
-            n_x, n_u = layout.n_x, layout.n_u
-            example = ", ".join(["1.0"] * min(n_x, 4) + [".."] * (n_x > 4) + ["0.1"] * min(n_u, 4))
-            remedy = (
-                f"Pass the cost that the plant has, such as stage_weight=[{example}] for states "
-                "weighted 1 and actions 0.1, twice the plant's own weights."
-            )
-            expected = "the weight of [x; u] in the stage cost 1/2 [x; u]' W [x; u]"
-            raise QPError.expected("stage_weight", "none", expected, remedy)
+            raise QPError.expected("stage_weight", "none", "a weight of [x; u]", REMEDY)
         if isinstance(terminal, str):
             terminal = terminal_riccati(A, B, stage, gamma, layout)
         elif terminal is None:

@@ -16,7 +16,7 @@ from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import LARGEST
 from torch_qpmpc.identification.ridge import ridge
 from torch_qpmpc.identification.steps import MEASURED, NEXT, logs, valid_steps
-from torch_qpmpc.mpc.cost import Cost
+from torch_qpmpc.mpc.cost import REMEDY, Cost
 from torch_qpmpc.mpc.layout import Layout
 
 #: Strengths of the ridge, down to those of costs without noise, and the share of the evidence's
@@ -226,10 +226,6 @@ def _profiled(seen: _Observed) -> Tensor:
     return torch.linalg.qr(torch.cat((F, pull)), mode="r")[1]
 
 
-REMEDY = (
-    "Pass stage_weight (in train.py task.stage_weight), the weight W of the cost "
-    "1/2 [x; u]' W [x; u], such as [1.0, 1.0, 0.1] for two states and an action."
-)
 #: The least R2 without a warning; and the share of the unexplained variance that a cost of the next
 #: state or outputs may leave.
 GOOD, LEFT = 0.9, 0.5
