@@ -103,7 +103,10 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("q: got a tensor on meta, expected one on H's device, cpu. Move", Q(q=GOOD["q"].to("meta"))),
     ("H: got torch.float16", lambda: qm.QuadraticProgram(**{k: v.half() for k, v in GOOD.items()})),
     ("qp: got dict, expected a QuadraticProgram. Pass", lambda: qm.solve_qp(GOOD)),
-    ("fixed: got a tensor on meta, expected one on the", lambda: qm.solve_qp(qp, fixed.to("meta"))),
+    (
+        "fixed: got a tensor on meta, expected one on cpu.",
+        lambda: qm.solve_qp(qp, fixed.to("meta")),
+    ),
     ("warm_start: got list, expected a", lambda: qm.solve_qp(qp, fixed, warm_start=[0])),
     ("A: got [[1.0, 0.0], [1.0]], expected a tensor, or what", M(A=[[1.0, 0.0], [1.0]])),
     ("A: got a torch.sparse_coo tensor, which is sparse, expected a", M(A=eye(2).to_sparse())),

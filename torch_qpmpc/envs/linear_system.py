@@ -122,13 +122,12 @@ class LinearSystem(Actuated, ABC):
 
     def __post_init__(self) -> None:
         remedy = "Use torch.tensor(.., dtype=torch.float64)."
-        check_tensor("A", self.A, "n_x", "n_x", batched=False, remedy=remedy)
-        n_x = len(self.A)
-        check_tensor("A", self.A, n_x, n_x, batched=False, remedy=remedy)
+        n_x = len(check_tensor("A", self.A, "n_x", "n_x", batched=False, remedy=remedy))
         check_tensor("B", self.B, n_x, "n_u", batched=False, remedy=remedy)
         n_u = self.B.shape[1]
-        for name, size in (("lb_s", n_x), ("ub_s", n_x), ("lb_a", n_u), ("ub_a", n_u)):
-            check_tensor(name, getattr(self, name), size, batched=False, remedy=remedy)
+        sizes = {"A": (n_x, n_x), "lb_s": (n_x,), "ub_s": (n_x,), "lb_a": (n_u,), "ub_a": (n_u,)}
+        for name, size in sizes.items():
+            check_tensor(name, getattr(self, name), *size, batched=False, remedy=remedy)
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, Tensor) and value.dtype != torch.float64:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_kind
+from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.qp.batching import align, schema
 from torch_qpmpc.qp.derivatives import N_THETA, gradients, tangents
@@ -71,9 +71,6 @@ def solve_qp(
         True
     """
     check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or call mpc.solve(s).")
-    for name, choice in (("solver", solver), ("on_failure", on_failure)):
-        if not isinstance(choice, str):
-            raise QPError.expected(name, repr(choice), "a name")
     if fixed is None:
         fixed = qp.q.new_zeros(0)
     return solve(qp, fixed, None, solver, on_failure, warm_start)
@@ -91,7 +88,10 @@ def solve(
 
     V and Q that keep the same entries share one elimination. None keeps the fixed entries.
     """
-    _check_fixed(qp, fixed)
+    check_tensor("fixed", fixed, "n_f", device=qp.q.device)
+    if fixed.shape[-1] > qp.n_z:
+        want = f"shape (*batch, n_f) with n_f <= n_z = {qp.n_z}"
+        raise QPError.expected("fixed", f"shape {tuple(fixed.shape)}", want)
     theta = (*qp.tensors(), fixed)
     try:
         batch = broadcast(qp.batch_shape, fixed.shape[:-1])
@@ -106,19 +106,6 @@ def solve(
         run = Eager.apply if learned else solve_now
     start = None if warm_start is None else _active(warm_start, (*batch, qp.lb.shape[-1]))
     return QPSolution(qp, *run(*theta, start, n_kept, solver, on_failure))
-
-
-def _check_fixed(qp: QuadraticProgram, fixed: Tensor) -> None:
-    if not isinstance(fixed, Tensor) or not fixed.is_floating_point():
-        got = fixed.dtype if isinstance(fixed, Tensor) else type(fixed).__name__
-        raise QPError.expected("fixed", got, "a floating-point torch.Tensor", "Convert it first.")
-    if fixed.device != qp.q.device:
-        got, remedy = f"a tensor on {fixed.device}", f"Move it: fixed.to({str(qp.q.device)!r})."
-        raise QPError.expected("fixed", got, f"one on the QP's {qp.q.device}", remedy)
-    n_z = qp.q.shape[-1]
-    if fixed.ndim == 0 or fixed.shape[-1] > n_z:
-        expected = f"shape (*batch, n_f) with n_f <= n_z = {n_z}"
-        raise QPError.expected("fixed", f"shape {tuple(fixed.shape)}", expected)
 
 
 def _active(warm_start: QPSolution | Tensor, want: tuple[int, ...]) -> Tensor:

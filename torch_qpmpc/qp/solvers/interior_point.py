@@ -120,18 +120,6 @@ class BatchedQPs(NamedTuple):
         pairs = self._asdict().items()
         return BatchedQPs(**{n: x if n in same else x[index] for n, x in pairs})
 
-    def apply_H(self, v: Tensor) -> Tensor:
-        """Return H v, ``(B, d)``."""
-        return self._multiply(self.H, v)
-
-    def rows(self, v: Tensor) -> Tensor:
-        """Return y = G v, ``(B, r)``."""
-        return self._multiply(self.G, v)
-
-    def apply_Gt(self, lam: Tensor) -> Tensor:
-        """Return G' lam, ``(B, d)``."""
-        return self._multiply(self.G.mT, lam)
-
     def factor(self, weight: Tensor) -> Tensor:
         """Return Cholesky factors of ``H + G' diag(weight) G``, slightly damped, ``(B, d, d)``."""
         if self.products is not None:
@@ -147,7 +135,8 @@ class BatchedQPs(NamedTuple):
             factor[failed] = torch.linalg.cholesky_ex(normal[failed])[0]
         return factor
 
-    def _multiply(self, matrices: Tensor, vectors: Tensor) -> Tensor:
+    def times(self, matrices: Tensor, vectors: Tensor) -> Tensor:
+        """Multiply the QPs' matrices by ``(B, j)``, to ``(B, i)``."""
         if self.products is not None:
             return vectors @ matrices[0].mT
         return torch.bmm(matrices, vectors.unsqueeze(-1)).squeeze(-1)
@@ -174,7 +163,7 @@ def _settled(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
     The KKT conditions are then linear, and the method of multipliers solves them: a large curvature
     holds the active rows, even dependent ones, and each pass reduces its error.
     """
-    y, stiffness = qps.rows(v), qps.force / qps.width
+    y, G_t, stiffness = qps.times(qps.G, v), qps.G.mT, qps.force / qps.width
     p, limit = y + lam / stiffness, qps.w / stiffness
     nearest = p.clip(qps.lower, qps.upper)
     excess = p - nearest
@@ -184,9 +173,9 @@ def _settled(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
     factor = qps.factor(weight)
     for _ in range(MULTIPLIER_PASSES):
         short = nearest - y
-        right = qps.apply_Gt(weight * short - lam) - qps.apply_H(v) - qps.g
+        right = qps.times(G_t, weight * short - lam) - qps.times(qps.H, v) - qps.g
         dv = torch.cholesky_solve(right.unsqueeze(-1), factor).squeeze(-1)
-        dy = qps.rows(dv)
+        dy = qps.times(qps.G, dv)
         v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
     return v, lam
 
@@ -297,20 +286,20 @@ def _follow(qps: BatchedQPs, end: Point, target: float) -> None:
 def _step(qps: BatchedQPs, point: Point, products: Tensor, gap: Tensor, going: Tensor) -> None:
     """Do one iteration of Mehrotra's method in place, for the QPs in the mask ``going``."""
     v, primal, dual, hold = point.v, point.primal, point.dual, point.hold
-    y, inverse = qps.rows(v), dual.reciprocal()
+    y, G_t, inverse = qps.times(qps.G, v), qps.G.mT, dual.reciprocal()
     ratio = primal * inverse
     D = ratio.sum(1).reciprocal_().minimum(qps.penalty.unsqueeze(1))
     factor = qps.factor(D.sum(1) + hold)
     short = point.level - y
     pull = DAMPING * qps.curvature.unsqueeze(-1) * v
-    right = qps.apply_Gt(hold * short - point.lam) - qps.apply_H(v) - qps.g - pull
+    right = qps.times(G_t, hold * short - point.lam) - qps.times(qps.H, v) - qps.g - pull
     room = point.bound - y.unsqueeze(1)
 
     def direction(offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return dv, dy = G dv and dlam = D (dy - offset), which solve the Newton equations."""
-        total = right + qps.apply_Gt((D * offset).sum(1))
+        total = right + qps.times(G_t, (D * offset).sum(1))
         dv = torch.cholesky_solve(total.unsqueeze(-1), factor).squeeze(-1)
-        dy = qps.rows(dv)
+        dy = qps.times(qps.G, dv)
         return dv, dy, (dy.unsqueeze(1) - offset).mul_(D).unsqueeze(1)
 
     # The predictor's target is zero products. Its step length determines the corrector's target.
