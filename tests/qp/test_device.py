@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 from unittest import mock
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -194,9 +195,9 @@ def test_what_a_device_leaves_takes_the_ordinary_steps(monkeypatch):
     expected, whole = mpc.solve(s), interior_point.solve
     for wrong in (slice(None, None, 2), slice(None)):
 
-        def spoilt(qps: Any, target: float, wrong: slice = wrong) -> Any:
-            answer = whole(qps, target)
-            answer.v[wrong] = torch.nan
+        def spoilt(qps: Any, wrong: slice = wrong, **options: Any) -> Any:
+            answer = whole(qps, **options)
+            answer.v[wrong] = np.nan
             return answer
 
         monkeypatch.setattr(interior_point, "solve", spoilt)

@@ -285,7 +285,7 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = doctored(LIES["zeros"])
     for name in list(BACKENDS):
         monkeypatch.setitem(BACKENDS, name, nothing)
-    monkeypatch.setattr(interior_point, "solve_arrays", lambda qps, **_: nothing(qps))
+    monkeypatch.setattr(interior_point, "solve", lambda qps, **_: nothing(qps))
     monkeypatch.setattr(refinement, "MAX_SETS", 0)
     lost = lambda self, active: self.unsolved(Status.NOT_CONVERGED)  # noqa: E731
     monkeypatch.setattr(Programs, "recalled", lost)

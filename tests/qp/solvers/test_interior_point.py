@@ -87,7 +87,7 @@ def test_hostile_cases_are_solved_to_rounding_and_agree_with_daqp(case, kind):
 def test_linear_programs_with_bounds_that_are_far_away(seed):
     """Bounds of 1e3 to 1e20 beside others: no length follows from a cost without curvature."""
     programs = programs_of(zero_H(Draw(seed), 128).known).scaled()
-    found = programs.recover(interior_point.solve_arrays(programs.reduced_qps()))
+    found = programs.recover(interior_point.solve(programs.reduced_qps()))
     answer = programs.recalled(found.active)
     assert (answer.status == 0).all()
 
@@ -103,7 +103,8 @@ def test_multipliers_of_inactive_rows_are_zero():
 
 
 def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
-    (v, lam, _), hard = answer, qps.w.isinf()
+    qps, (v, lam) = SoftQPs._make(map(torch.from_numpy, qps)), map(torch.from_numpy, answer[:2])
+    hard = qps.w.isinf()
     Hv, y = torch.einsum("bde,be->bd", qps.H[qps.group], v), times(qps.G[qps.group], v)
     forces = torch.stack((Hv, qps.g, torch.einsum("brd,br->bd", qps.G[qps.group], lam)))
     outside = (y - y.clip(qps.l, qps.u)).abs()
@@ -115,10 +116,6 @@ def residual(qps: SoftQPs, answer: BackendSolution) -> Tensor:
     over = ((lam.abs() - qps.w).clamp(min=0) / (1 + qps.w.masked_fill(hard, 0))).amax(-1)
     errors = slope, (outside * hard / (1 + y.abs())).amax(-1), over, gap / (1 + cost.abs())
     return torch.stack(errors).amax(0)
-
-
-def as_tensors(**arrays: np.ndarray) -> SoftQPs:
-    return SoftQPs(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 def random_qps(
@@ -135,7 +132,7 @@ def random_qps(
     w = 10.0 ** random.choice([-1, 0, 2], y.shape)
     w[random.random(y.shape) < 0.3] = np.inf
     room[:, :, -d:], w[:, -d:] = 3.0, np.inf
-    return as_tensors(
+    return SoftQPs(
         H=factor @ factor.transpose(0, 2, 1) / d,
         G=G,
         group=np.zeros(count, dtype=np.int64),
@@ -164,7 +161,7 @@ def test_an_empty_batch(matrices):
     none, group = np.zeros((0, 4)), np.zeros(0, dtype=np.int64)
     H, G = np.zeros((matrices, 2, 2)), np.zeros((matrices, 4, 2))
     answer = interior_point.solve(
-        as_tensors(H=H, G=G, group=group, g=np.zeros((0, 2)), l=none, u=none, w=none)
+        SoftQPs(H=H, G=G, group=group, g=np.zeros((0, 2)), l=none, u=none, w=none)
     )
     assert [x.shape for x in answer] == [(0, 2), (0, 4), (0,)]
 
@@ -185,7 +182,7 @@ def one_row(count: int = 3, **changes: Any) -> SoftQPs:
         "u": ones,
         "w": np.tile([np.inf, 5.0], (count, 1)),
     }
-    return as_tensors(**(arrays | changes))
+    return SoftQPs(**(arrays | changes))
 
 
 def test_without_variables_the_rows_are_only_checked():
@@ -231,8 +228,8 @@ HOPELESS = {
 def test_without_a_solution_the_answer_is_finite_and_soon(case):
     qps = HOPELESS[case]
     answer = interior_point.solve(qps)
-    assert answer.v.isfinite().all()
-    assert answer.lam.isfinite().all()
+    assert np.isfinite(answer.v).all()
+    assert np.isfinite(answer.lam).all()
     assert answer.iterations.max() <= MAX_ITERATIONS
     assert residual(qps, answer).min() > 1e-3
 

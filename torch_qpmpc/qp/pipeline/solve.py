@@ -316,7 +316,7 @@ def backed(solve: Backend, passes: int = 0) -> Step:
 
 def _early(device: torch.device | None, programs: Programs, best: BatchSolution) -> BatchSolution:
     """Solve by the interior point until it shows the active sets, and from these."""
-    solve = partial(interior_point.solve_arrays, device=device or "cpu", target=EARLY)
+    solve = partial(interior_point.solve, device=device or "cpu", target=EARLY)
     answer = backed(solve)(programs, best)
     recalled = programs.recalled(answer.active)._replace(iterations=answer.iterations)
     answer.improve(np.arange(len(programs)), recalled)
@@ -380,7 +380,7 @@ def _eliminated(eliminate: Any, programs: Programs, best: BatchSolution) -> Batc
     for target in (EARLY, MIDDLE, LAST):
         if not answer.status.any():
             break
-        solve = partial(interior_point.solve_arrays, target=target, steps=SETTLING)
+        solve = partial(interior_point.solve, target=target, steps=SETTLING)
         answer.improve(every, backed(solve, PASSES)(other, best))
     return answer
 

@@ -19,7 +19,7 @@ Backend = Callable[[SoftQPs], BackendSolution]
 BACKENDS: dict[str, Backend] = {
     "proxqp": proxqp.solve,
     "daqp": daqp.solve,
-    "torch": interior_point.solve_arrays,
+    "torch": interior_point.solve,
 }
 
 

@@ -143,18 +143,20 @@ class BatchedQPs(NamedTuple):
 
 
 @torch.no_grad()
-def solve(qps: SoftQPs, target: float = LAST, steps: int = 0) -> BackendSolution:
-    """Solve a batch of tensors on their device; take ``steps`` on active sets at the end.
+def solve(
+    qps: SoftQPs, device: torch.device | str = "cpu", target: float = LAST, steps: int = 0
+) -> BackendSolution:
+    """Solve a batch of arrays on a device; take ``steps`` on active sets at the end.
 
     Infeasible and unbounded QPs have finite results, which the certificate rejects.
     """
-    form = BatchedQPs.of(qps)
+    form = BatchedQPs.of(SoftQPs._make(torch.from_numpy(x).to(device) for x in qps))
     point = _begin(form)
     _follow(form, point, target)
     v, lam = point.v, point.lam
     for _ in range(steps):
         v, lam = _settled(form, v, lam)
-    return BackendSolution(v, lam, point.steps)
+    return BackendSolution._make(x.numpy(force=True) for x in (v, lam, point.steps))
 
 
 def _settled(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
@@ -178,14 +180,6 @@ def _settled(qps: BatchedQPs, v: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
         dy = qps.times(qps.G, dv)
         v, y, lam = v + dv, y + dy, lam + weight * (dy - short)
     return v, lam
-
-
-def solve_arrays(
-    qps: SoftQPs, device: torch.device | str = "cpu", target: float = LAST, steps: int = 0
-) -> BackendSolution:
-    """Solve a batch of arrays on a device, as `solve`."""
-    tensors = SoftQPs._make(torch.from_numpy(x).to(device) for x in qps)
-    return BackendSolution._make(x.numpy(force=True) for x in solve(tensors, target, steps))
 
 
 class Point(NamedTuple):
