@@ -194,9 +194,15 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("a: got shape (5, 1), expected shape (*batch, 2).", lambda: pm.applied(zeros(5, 1))),
     ("rng: got 1, expected a NumPy or torch generator. From a seed:", lambda: pm.starts(1, 3)),
     ("nu: got shape (5, 1), expected", lambda: pm.step(zeros(5, 4), zeros(5, 2), zeros(5, 1))),
-    ("action: got 'a', expected finite numbers of shape (2,). Pass one", lambda: episode.step("a")),
-    ("action: got array([nan, nan]), expected finite", lambda: episode.step(np.full(2, np.nan))),
-    ("action: got array([[0., 0.]]), expected finite", lambda: episode.step(np.zeros((1, 2)))),
+    (
+        "action: got 'a', expected a tensor, or what torch.as_tensor takes",
+        lambda: episode.step("a"),
+    ),
+    ("action: got NaN or inf, expected finite entries", lambda: episode.step(np.full(2, np.nan))),
+    (
+        "action: got shape (1, 2), expected shape (2,). Pass one action",
+        lambda: episode.step(np.zeros((1, 2))),
+    ),
     ("num_envs: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(0, 5, 1)),
     ("task.id: got NoneType, expected a str.", lambda: GymnasiumPlant(None)),
     ("max_steps: got 0, expected a whole number >= 1.", lambda: pendulum.vectorised(1, 0, 1)),

@@ -50,8 +50,8 @@ def test_a_C_that_does_not_determine_the_states_is_refused():
     (torch.zeros(14, 28), None, r"C: got shape \(14, 28\)"),
     (torch.zeros(0, 3), None, r"C: got shape \(0, 3\)"),
     (torch.zeros(15, 28), torch.zeros(3), r"b: got shape \(3,\)"),
-    (torch.full((15, 28), torch.nan), None, "C, b: got NaN or inf"),
-    (torch.eye(15, 28), torch.full((15,), torch.inf), "C, b: got NaN or inf"),
+    (torch.full((15, 28), torch.nan), None, "C: got NaN or inf"),
+    (torch.eye(15, 28), torch.full((15,), torch.inf), "b: got NaN or inf"),
 )
 def test_bad_input(C, b):
     prediction_form(C, N_X, N_U, b)

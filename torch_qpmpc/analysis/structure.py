@@ -24,7 +24,7 @@ from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.mpc.layout import Layout, band_distance
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.validation import check_one_model, without_gradients
+from torch_qpmpc.mpc.validation import as_tensor, check_one_model, without_gradients
 
 FORM_REMEDY = "Pass torch_qpmpc.analysis.structure.predictions(mpc)."
 #: The largest accepted condition number of C's state columns, after scaling its rows. The relative
@@ -105,9 +105,7 @@ def prediction_form(
         want = f"(N n_x, n_p + N (n_x + n_u)) with n_x = {n_x}, n_u = {n_u}"
         raise QPError.expected("C", f"shape {tuple(C.shape)}", f"{want}, n_p = {layout.n_p}")
     b = C.new_zeros(n_c) if b is None else check_tensor("b", b, n_c, batched=False)
-    C, b = (x.to("cpu", torch.float64) for x in (C, b))
-    if not (C.isfinite().all() and b.isfinite().all()):
-        raise QPError.expected("C, b", "NaN or inf", "finite entries")
+    C, b = as_tensor("C", C), as_tensor("b", b)
     # Rows of unit norm, so that their scale does not affect the condition number.
     size = C.norm(dim=-1, keepdim=True).clamp(min=torch.finfo(C.dtype).tiny)
     C, b = C / size, b.unsqueeze(-1) / size

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch_qpmpc.checks import check_kind, check_tensor
 from torch_qpmpc.envs.vectorised import VectorisedEnv
 from torch_qpmpc.errors import QPError
+from torch_qpmpc.mpc.validation import as_tensor
 
 #: A random generator: torch's in the TorchRL environments, numpy's in the Gymnasium environments
 #: and in the evaluation.
@@ -197,18 +198,6 @@ class LinearSystem(Actuated, ABC):
         return LinearSystemEnv(self, num_envs, max_steps, seed=seed)
 
 
-def checked_action(action: Any, space: gymnasium.Space) -> Tensor:
-    """Return ``action`` in float64; raise `QPError` unless it is finite and fits ``space``."""
-    try:
-        a = torch.as_tensor(np.asarray(action, dtype=np.float64))
-    except (TypeError, ValueError):
-        a = torch.tensor(torch.nan)
-    if a.shape != space.shape or not a.isfinite().all():
-        expected, remedy = f"finite numbers of shape {space.shape}", "Pass one action, not a batch."
-        raise QPError.expected("action", repr(action), expected, remedy)
-    return a
-
-
 class LinearSystemGymEnv(gymnasium.Env):
     """A Gymnasium environment of ``plant``, truncated by its registration, never terminated.
 
@@ -242,7 +231,8 @@ class LinearSystemGymEnv(gymnasium.Env):
         Raises:
             QPError: the action does not fit or is not finite.
         """
-        a = checked_action(action, self.action_space)
+        a, remedy = as_tensor("action", action), "Pass one action, not a batch."
+        check_tensor("action", a, self.plant.n_u, batched=False, remedy=remedy)
         reward = -self.plant.cost(self._s, a).item()
         self._nu = self.plant.noise(self._nu, self.plant.draw(self.np_random, 1)[0])
         self._s = self.plant.step(self._s, a, self._nu)
