@@ -137,7 +137,7 @@ MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     ("priority_weight: got NaN or inf, expected finite", with_entry("priority_weight", WEIGHTS)),
     ("tensordict: got an empty batch, expected at least", lambda: make_loss()(make_batch(3)[:0])),
     ("mpc: got QPActorValueOperator, expected a QPMPC. Pass the QPMPC", lambda: qm.GaussNewton(op)),
-    ("rates: got list, expected a mapping such as {'cost': .., 'constraints':", G(scales=[1.0])),
+    ("rates: got list, expected a Mapping. Map names: {'cost': .., ", G(scales=[1.0])),
     ("scales[H]: got 0.0, expected a finite number >", G(scales={"cost": 0.0, "constraints": 0.0})),
     ("target: got shape (), expected shape (4,). Squeeze its", lambda: gn.step(S, Aa, tensor(0.0))),
     ("weighted: got 'yes', expected True or False.", lambda: Loss(weighted="yes")),

@@ -22,7 +22,6 @@ from torch_qpmpc.learning.penalties import Penalties
 from torch_qpmpc.learning.q_learning import QPQLearningLoss
 from torch_qpmpc.learning.td_error import td_loss, td_metadata
 from torch_qpmpc.mpc.module import QPMPC
-from torch_qpmpc.mpc.parameters import matrix
 from torch_qpmpc.mpc.validation import check_one_model
 
 Scalars = Mapping[str, Tensor]
@@ -123,7 +122,8 @@ def rate_of_C(mpc: QPMPC, optimizer: Optimizer) -> tuple[Tensor, float]:
     Raises:
         QPError: the optimiser does not move a C that is free.
     """
-    C = matrix(mpc, "C")
+    free = mpc.structure == "free" and "C" in mpc.learned
+    C = mpc.leaves("C")[0] if free else None
     groups = (x for x in optimizer.param_groups if any(C is leaf for leaf in x["params"]))
     if C is None or (group := next(groups, None)) is None:
         want = "one that moves a free C, which is penalised"

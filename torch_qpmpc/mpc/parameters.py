@@ -20,7 +20,7 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import NONNEGATIVE, check_kind, check_number, check_tensor
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Masked, Tied
+from torch_qpmpc.mpc.parametrizations import SIGNED, Banded, LinearRows, Tied
 from torch_qpmpc.mpc.validation import CONSTRAINTS, COST
 from torch_qpmpc.qp.kernels.linalg import equal
 from torch_qpmpc.qp.program import broadcast
@@ -70,16 +70,6 @@ def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
     return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
 
 
-def matrix(module: Any, name: str) -> nn.Parameter | None:
-    """Return the parameter with the entries of a part, all or masked.
-
-    It is None if the part is computed from others, or is not learned.
-    """
-    own = chain(module, name)
-    whole = not own or (len(own) == 1 and isinstance(own[0], Masked))
-    return leaves(module, name)[0] if whole and name in module.learned else None
-
-
 def readable(module: Any) -> dict[str, Tensor]:
     """Return the learned parts, detached: A, B, E and D for C and G, and shared values once."""
     values = {}
@@ -95,9 +85,7 @@ def readable(module: Any) -> dict[str, Tensor]:
 
 def groups(module: Any, rates: Mapping[str, float]) -> list[dict[str, Any]]:
     """Return `QPMPC.parameter_groups`."""
-    if not isinstance(rates, Mapping):
-        got = type(rates).__name__
-        raise QPError.expected("rates", got, "a mapping such as {'cost': .., 'constraints': ..}")
+    check_kind("rates", rates, Mapping, "Map names: {'cost': .., 'constraints': ..}.")
     known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
     if unknown := set(rates) - known:
         raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
