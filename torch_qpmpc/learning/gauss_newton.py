@@ -300,8 +300,7 @@ class GaussNewton(torch.optim.Optimizer):
     def _free_C(self) -> Tensor | None:
         """Return the parameter of C if all of it is learned, free and not frozen."""
         C = self._mpc._parameters.get("C")
-        leaves = (leaf for group in self.param_groups for leaf in group["params"])
-        return next((leaf for leaf in leaves if leaf is C and leaf.requires_grad), None)
+        return C if C is not None and C.requires_grad else None
 
     def _blocks(self, solution: QPSolution, root: Tensor, S: Tensor | None) -> list[Block]:
         """Return Q's gradients in each learned part that is not frozen, times ``root``."""
