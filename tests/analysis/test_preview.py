@@ -24,7 +24,6 @@ from torch_qpmpc.analysis.structure import (
     one_step_error,
     prediction_form,
     predictions,
-    second_moment,
     stage_models,
     toeplitz_defect,
 )
@@ -107,7 +106,8 @@ def test_errors_of_the_model():
     assert_close(one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
     s, a, d = normal(50, N_X), normal(50, N_U, seed=1), normal(50, N_D, seed=2)
     error = s @ (wrong[0] - A).mT + a @ (wrong[1] - B).mT + d @ (wrong[2] - E).mT
-    moment = second_moment(s, a, d)
+    v = torch.cat((s, a, d, torch.ones(50, 1)), -1)
+    moment = v.mT @ v / 50
     expected = error.square().sum(-1).mean().sqrt()
     assert_close(one_step_error(found, *wrong[:2], OFFSET, moment, wrong[2]), expected)
     assert_close(one_step_error(found, A, B, E=E), OFFSET.norm())

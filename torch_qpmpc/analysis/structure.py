@@ -300,13 +300,9 @@ def _without_offset(maps: Tensor) -> Tensor:
     return maps[..., :-1].square().sum((-1, -2))
 
 
-def second_moment(s: Tensor, a: Tensor, d: Tensor | None = None) -> Tensor:
-    """Return E[v v'] ``(n_v, n_v)`` of v = (s, a, d, 1) over samples ``(*batch, n)``.
-
-    d are the known signals d_k; None without a preview.
-    """
-    d = a[..., :0] if d is None else d
-    v = torch.cat((s, a, d, torch.ones_like(a[..., :1])), dim=-1)
+def second_moment(s: Tensor, a: Tensor) -> Tensor:
+    """Return E[v v'] ``(n_v, n_v)`` of v = (s, a, 1) over samples ``(*batch, n)``."""
+    v = torch.cat((s, a, torch.ones_like(a[..., :1])), dim=-1)
     v = v.reshape(-1, v.shape[-1])
     return v.mT @ v / len(v)
 

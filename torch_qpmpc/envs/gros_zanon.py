@@ -74,8 +74,3 @@ class GrosZanonLTI(LinearSystem):
     def mean_noise(self) -> Tensor:
         """Return [-0.05, 0]."""
         return self.noise(torch.zeros_like(self.lb_s), self.A.new_tensor([0.5]))
-
-    def wrong_model(self) -> tuple[Tensor, Tensor]:
-        """Return the model that learning starts from: A_0 ``(2, 2)`` and B_0 ``(2, 1)``."""
-        as_A = self.A.new_tensor
-        return as_A([[1, 0.25], [0, 1]]), as_A([[0.0312], [0.25]])

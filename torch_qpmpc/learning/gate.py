@@ -86,11 +86,6 @@ class PairedTest:
         return float(self._d.mean()) if self.pairs else math.nan
 
     @property
-    def bound(self) -> float:
-        """The largest loss of the next pair that the test allows for; inf while there are few."""
-        return float(_bounds(self._d, self._given)[-1])
-
-    @property
     def vetoed(self) -> bool:
         """True if a pair has lost more than the bound before it."""
         return bool((self._d > _bounds(self._d, self._given)[:-1]).any())

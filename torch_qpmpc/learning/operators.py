@@ -51,8 +51,7 @@ class _QPOperator(TensorDictModuleBase):
         self.active_set_key, self.preview_key = active_set_key, preview_key
         theta_keys = {} if theta_keys is None else theta_keys
         check_kind("theta_keys", theta_keys, Mapping, "Map names to keys: {'q': ('theta', 'q')}.")
-        if theta_keys:
-            check_names("theta_keys", theta_keys, mpc)
+        check_names("theta_keys", theta_keys, mpc)
         self.theta_keys = dict(theta_keys)
         preview, active = ([] if key is None else [key] for key in (preview_key, active_set_key))
         in_keys, out_keys = [*in_keys, *preview, *theta_keys.values()], [out_key, *active]

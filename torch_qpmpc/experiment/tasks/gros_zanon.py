@@ -18,7 +18,7 @@ WEIGHT = torch.tensor([1.0, 1.0, 0.5])
 def wrong_scheme(cfg: Config, plant: GrosZanonLTI) -> Scheme:
     """Return their wrong model; as in the original, the first upper bound is too wide by one."""
     wide = plant.ub_s + torch.tensor([1.0, 0.0]).to(plant.ub_s)
-    model = Model(*plant.wrong_model())
+    model = Model(A=[[1, 0.25], [0, 1]], B=[[0.0312], [0.25]])
     return plant_scheme(cfg, plant, model, WEIGHT, state_bounds=(plant.lb_s, wide))
 
 
