@@ -75,14 +75,8 @@ def make_learner(cfg: Config, operator: QPActorValueOperator) -> Learner:
     scheduler = LambdaLR(optimizer, lambda k: 1 - (1 - last) * min(k / updates, 1))
     make = second_order if isinstance(optimizer, GaussNewton) else first_order
     update = make(mpc, loss_module, optimizer, penalties)
-    return Learner(
-        update,
-        loss_module,
-        operator.get_policy_operator(POLICY_ACTIVE_SET),
-        optimizer,
-        scheduler,
-        penalties,
-    )
+    actor = operator.get_policy_operator(POLICY_ACTIVE_SET)
+    return Learner(update, loss_module, actor, optimizer, scheduler, penalties)
 
 
 def make_penalties(cfg: Config, mpc: QPMPC) -> Penalties:

@@ -89,9 +89,7 @@ class Evaluation:
         first = loops["start"]  # of which a finite state has a cost, whatever comes later
         check_rewards(replace(first, costs=first.costs[:1]), physics)
         costs = {name: loops.pop(name).J for name in rivals}
-        return cls(
-            cfg, physics, {"start": loops["start"], "learned": loops["start"], **loops}, costs
-        )
+        return cls(cfg, physics, {"start": first, "learned": first, **loops}, costs)
 
     def evaluate(self, policy: Callable[[Tensor], Tensor], name: str = "learned") -> None:
         """Evaluate what has been learned so far."""

@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ NUMBERS = ("seed", "closed_gap", "J_start", "J_best", "J_final", "J_true_model")
 NUMBERS += ("canonical_distance",)
 
 
-class RunFolder:
+class RunFolder(AbstractContextManager["RunFolder"]):
     """The output of one run; a context manager, which flushes at its end.
 
     Scalars go to metrics.csv and to TensorBoard. A resumed run keeps the rows up to the update
@@ -45,9 +46,6 @@ class RunFolder:
             text = OmegaConf.to_yaml(cfg.model_dump(exclude_unset=True))
             write_whole(self.path / "config.yaml", text.encode())
         self.logger = TensorboardLogger("tensorboard", str(self.path))
-
-    def __enter__(self) -> RunFolder:
-        return self
 
     def __exit__(self, *_: object) -> None:
         try:

@@ -170,9 +170,8 @@ class QPQLearningLoss(LossModule):
         """Do nothing: `_load_from_state_dict` has compared it already."""
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
-        super()._load_from_state_dict(
-            self.operator.module.checked_state(state_dict, prefix), prefix, *args
-        )
+        state_dict = self.operator.module.checked_state(state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
@@ -218,11 +217,9 @@ class QPQLearningLoss(LossModule):
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self
-        options |= {"tensor_keys": self._estimator_keys()}
+        options |= {"tensor_keys": self._estimator_keys(), "value_network": self.state_value_network}
         options |= {"supported": self.SUPPORTED_VALUE_ESTIMATORS}
-        dispatch_value_estimator(
-            self, value_type, value_network=self.state_value_network, **options
-        )
+        dispatch_value_estimator(self, value_type, **options)
         return None
 
     @dispatch()
