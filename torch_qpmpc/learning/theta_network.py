@@ -82,10 +82,10 @@ class ThetaNetwork(TensorDictModuleBase):
         Raises:
             QPError: an input is missing, or their entries are not n_p.
         """
-        last: Any = self.net[-1]
+        first: Any = self.net[0]
         parts = [entry(tensordict, key) for key in self.in_keys]
-        inputs = torch.cat([part.to(last.bias.dtype) for part in parts], -1)
-        check_tensor("p", inputs, self.net.in_features)
+        inputs = torch.cat([part.to(first.bias.dtype) for part in parts], -1)
+        check_tensor("p", inputs, first.in_features)
         counts = [shape.numel() for shape in self.shapes.values()]
         flat = self.net(inputs).tanh().split(counts, -1)
         for (name, shape), entries in zip(self.shapes.items(), flat, strict=True):
