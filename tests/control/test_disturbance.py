@@ -9,7 +9,7 @@ import pytest
 import torch_qpmpc as qm
 from tests.refused import refused
 from torch_qpmpc import QPError
-from torch_qpmpc.control.disturbance import Steady, choose, chosen
+from torch_qpmpc.control.disturbance import Steady, choose
 from torch_qpmpc.control.scaling import Scaling
 from torch_qpmpc.control.state_space import read_model
 
@@ -87,12 +87,13 @@ def test_drifts_of_a_log_come_first_in_the_units_of_their_outputs():
 
 
 @pytest.mark.parametrize("wanted", ["auto", None, {"y1": "u1"}, {"y1": "u2", "y2": "output"}])
-def test_what_a_user_chose_is_chosen_again_for_another_model(wanted):
+def test_what_a_user_chose_is_chosen_again_for_another_model(wanted, tmp_path):
     """A model that learned from a log had the automatic ones."""
     plant = read_model((np.diag([0.8, 0.5]), np.eye(2), np.ones((2, 2)) + np.eye(2)))
-    w, sizes = choose(plant, wanted), Scaling.of(plant)
-    assert choose(plant, chosen(plant, w, sizes), sizes).names == w.names
-    assert (chosen(plant, w, sizes) == "auto") is (wanted == "auto")
+    mpc = qm.LinearMPC(plant, 5, Q=1.0, R=1.0, disturbances=wanted)
+    mpc.save(tmp_path / "a.qpmpc")
+    for own in (mpc, qm.LinearMPC.load(tmp_path / "a.qpmpc")):
+        assert own.design.disturbances.wanted == wanted
 
 
 def test_a_drift_that_is_an_integrating_input_s_takes_its_place():

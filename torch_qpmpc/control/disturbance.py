@@ -51,13 +51,15 @@ OUTPUT, PREFIX = "output", "disturbance of "
 class Disturbances(NamedTuple):
     """B_w ``(n, n_w)`` and C_w ``(n_y, n_w)``, and a name for each entry of w.
 
-    ``changes`` are the standard deviations of w+ - w that a log shows, zero where it shows none.
+    ``changes`` are the standard deviations of w+ - w that a log shows, zero where it shows none,
+    and ``wanted`` is what `choose` was asked for.
     """
 
     B: Array
     C: Array
     names: tuple[str, ...]
     changes: Array | float = 0.0
+    wanted: Any = "auto"
 
 
 def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = None) -> Disturbances:
@@ -75,7 +77,7 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
     """
     n, _, n_y, _ = plant.sizes
     if wanted is None:
-        return Disturbances(np.zeros((n, 0)), np.zeros((n_y, 0)), ())
+        return Disturbances(np.zeros((n, 0)), np.zeros((n_y, 0)), (), wanted=None)
     normal = (scaling or Scaling.of(plant)).plant(plant)
     check_observable(normal)
     kinds: Mapping[str, Any] = wanted if isinstance(wanted, Mapping) else {}
@@ -93,18 +95,7 @@ def choose(plant: StateSpace, wanted: Any = "auto", scaling: Scaling | None = No
         remedy = "At an integrating mode take a disturbance of its input, and at others one of the "
         remedy += "output; 'auto' chooses so. There can be no more disturbances than outputs."
         raise QPError.expected("disturbances", got, "detectable disturbances", remedy)
-    return _placed(plant, kinds)
-
-
-def chosen(plant: StateSpace, w: Disturbances, scaling: Scaling) -> Any:
-    """Return the argument by which `choose` returned w."""
-    if w.names and choose(plant, "auto", scaling).names == w.names:
-        return "auto"
-    named = [name.removeprefix(PREFIX) for name in w.names]
-    free = (name for name in plant.outputs if name not in named)
-    return {
-        next(free) if x in plant.inputs else x: x if x in plant.inputs else OUTPUT for x in named
-    }
+    return _placed(plant, kinds)._replace(wanted=wanted)
 
 
 def _placed(plant: StateSpace, kinds: Mapping[str, Any]) -> Disturbances:

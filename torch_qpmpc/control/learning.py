@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from torch_qpmpc.checks import check_seed, check_whole
 from torch_qpmpc.control.design import Design
-from torch_qpmpc.control.disturbance import choose, chosen
+from torch_qpmpc.control.disturbance import choose
 from torch_qpmpc.control.law import Law, Memory
 from torch_qpmpc.control.linear_mpc import LinearMPC
 from torch_qpmpc.control.observer import SMALL
@@ -225,8 +225,7 @@ def _with_model(law: Law, model: Identified) -> Law:
     """Return the law with another model."""
     old = law.design
     plant = read_model(model, prices=old.linear.values())
-    scaling = replace(old, plant=plant).scaling
-    w = choose(plant, chosen(old.plant, old.disturbances, old.scaling), scaling)
+    w = choose(plant, old.disturbances.wanted, replace(old, plant=plant).scaling)
     design = replace(old, plant=plant, disturbances=w)
     mpc = LinearMPC.of_design(design, **law.mpc.options)
     return Law.of(mpc, law.noise, law.drift if w.names == old.disturbances.names else None)
