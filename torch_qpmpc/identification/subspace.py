@@ -47,7 +47,7 @@ ORDERS, LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20), (2, 5, 10, 20, 40)
 #: blocks of LONG steps, or fewer so that there are BLOCKS, but no shorter than SHORT.
 PARTS, BLOCKS, LONG, SHORT = 4, 12, 200, 10
 #: Steps of the predictions that decide.
-HORIZONS = (1, 2, 5, 10, 20)
+HORIZONS = np.array([1, 2, 5, 10, 20])
 #: Gaps of so many rows are filled for the starts of the fits.
 FILLED = 20
 #: First steps of a trajectory in which its filter settles, at most a quarter: they decide nothing.
@@ -136,8 +136,9 @@ def fit_state_space(
         par = em(_states(_predictor(filled, lags, order), order), data, SOME)
         likely, held = em(par, data, MANY, GROWTH, GAIN), _Held(trajectories)
 
-        def far(one: Noisy) -> float:
-            return _far(steady(one), data, held)
+        def far(one: Noisy) -> float:  # the score of predictions over the last horizon
+            sums = _sums([steady(one)] * PARTS, data, held).sum(1)
+            return _score(*sums[:, np.flatnonzero(sums[1].any(1))[-1:]])
 
         par = min((likely, par), key=far) if likely is not par else par
         drifting, count = with_drifts(par, data)
@@ -172,13 +173,9 @@ def held_out_errors(
 
     The filter knows the outputs before. Errors of the steps in which it settles are NaN.
     """
-    block = _Held(trajectories).targets(range(1, horizon + 1))
-    block = np.delete(block, np.cumsum([one.steps + 1 for one in trajectories]) - 1, 0)
-    total = np.full((*block.shape, trajectories[0].y.shape[1]), np.nan)
-    for part, model in enumerate(parts):
-        mask = (block >= 0) & (block % PARTS == part)
-        total[mask] = np.concatenate(_errors(model, signals(trajectories), horizon))[mask]
-    return total
+    held, steps = _Held(trajectories), np.arange(1, horizon + 1)
+    errors = held.errors(parts, signals(trajectories), steps)
+    return np.delete(errors, np.cumsum([one.steps + 1 for one in trajectories]) - 1, 0)
 
 
 def whiteness(model: Innovations, trajectories: Sequence[Trajectory]) -> Array:
@@ -294,15 +291,25 @@ class _Held:
         pairs = [(one, mask) for one, mask in zip(data, masks, strict=True) if not mask.all()]
         return [one._replace(y=np.where(mask[:, None], np.nan, one.y)) for one, mask in pairs]
 
-    def targets(self, steps: Sequence[int]) -> Array:
+    def targets(self, steps: Array) -> Array:
         """Return the blocks of the targets so many steps after each row, -1 for none."""
         found = []
         for rows in self.rows:
             T = len(rows) - 1
-            target = np.arange(T + 1)[:, None] + np.array(steps)
+            target = np.arange(T + 1)[:, None] + steps
             found.append(np.where(target <= T, rows[np.minimum(target, T)], -1))
             found[-1][: min(SETTLING, T // 4)] = -1
         return np.concatenate(found)
+
+    def errors(self, models: Sequence[Innovations], data: Sequence[Signals], steps: Array) -> Array:
+        """Return the errors of predictions of the `targets`, NaN without one."""
+        block = self.targets(steps)
+        total = np.full((*block.shape, data[0].y.shape[1]), np.nan)
+        for part, model in enumerate(models):
+            own, mask = _errors(model, data, max(steps)), (block >= 0) & (block % PARTS == part)
+            errors = np.concatenate([np.pad(e, ((0, 1), (0, 0), (0, 0))) for e in own])
+            total[mask] = errors[:, steps - 1][mask]
+        return total
 
 
 def _feasible(starts: Sequence[Sequence[Signals]], longest: int) -> tuple[int, ...]:
@@ -327,11 +334,10 @@ def _compare(
     The starts of all orders and lags are compared, and the likeliest models of the best of them.
     """
     held = _Held(trajectories)
-    block = held.targets(HORIZONS)
     folds, bases = ([held.out(part, x) for part in range(PARTS)] for x in (data, filled))
 
     def judged(found: dict[tuple[int, int], list[Innovations]]) -> list[Candidate]:
-        sums = [_sums(models, data, held.count, block) for models in found.values()]
+        sums = [_sums(models, data, held) for models in found.values()]
         scores = np.array([_score(*parts.sum(1)) for parts in sums])
         used = np.flatnonzero(sums[0][1].any((1, 2)))
         # The jackknife over the blocks gives the errors of the scores' distances.
@@ -362,21 +368,16 @@ def _compare(
     return list(zip(judged(found), found.values(), strict=True))
 
 
-def _sums(
-    models: Sequence[Innovations], data: Sequence[Signals], count: int, block: Array
-) -> Array:
+def _sums(models: Sequence[Innovations], data: Sequence[Signals], held: _Held) -> Array:
     """Return the squared errors of the blocks and their number ``(2, count, horizons, n_y)``."""
-    y = np.concatenate([one.y for one in data])
-    sums = np.zeros((2, count, len(HORIZONS), y.shape[1]))
-    for part, model in enumerate(models):
-        parts = _errors(model, data, max(HORIZONS))
-        errors = np.concatenate([np.pad(e, ((0, 1), (0, 0), (0, 0))) for e in parts])
-        rows, places = np.nonzero((block >= 0) & (block % PARTS == part))
-        steps = np.array(HORIZONS)[places]
-        e, seen = errors[rows, steps - 1], np.isfinite(y[rows + steps])
-        off = np.where(np.abs(e) < WORST, e, WORST) ** 2 * seen  # NaN is WORST
-        for total, weights in zip(sums, (off, seen), strict=True):
-            np.add.at(total, (block[rows, places], places), weights)
+    block, y = held.targets(HORIZONS), np.concatenate([one.y for one in data])
+    sums = np.zeros((2, held.count, len(HORIZONS), y.shape[1]))
+    rows, places = np.nonzero(block >= 0)
+    e = held.errors(models, data, HORIZONS)[rows, places]
+    seen = np.isfinite(y[rows + HORIZONS[places]])
+    off = np.where(np.abs(e) < WORST, e, WORST) ** 2 * seen  # NaN is WORST
+    for total, weights in zip(sums, (off, seen), strict=True):
+        np.add.at(total, (block[rows, places], places), weights)
     return sums
 
 
@@ -384,12 +385,6 @@ def _score(total: Array, count: Array) -> float:
     """Return the mean logarithm of the outputs' mean squared errors of all horizons."""
     mse = (total / np.maximum(count, 1)).sum(0) / np.maximum((count > 0).sum(0), 1)
     return float(np.log(np.maximum(mse[count.any(0)], EXACT)).mean())
-
-
-def _far(model: Innovations, data: Sequence[Signals], held: _Held) -> float:
-    """Return the score of the predictions over the last horizon."""
-    sums = _sums([model] * PARTS, data, held.count, held.targets(HORIZONS)).sum(1)
-    return _score(*sums[:, np.flatnonzero(sums[1].any(1))[-1:]])
 
 
 def equal_candidates(rows: Sequence[Candidate]) -> list[Candidate]:
