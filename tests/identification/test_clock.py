@@ -112,7 +112,7 @@ SPELLINGS = [
     *(("%Y%m%d%H%M%S", dt, False) for dt in (1, 37, 600)),
     *(("%Y%m%d%H%M", dt, False) for dt in (60, 420)),
     *(("%Y%m%d%H", 3600, False), ("%Y%m%d", 86400, False), ("%Y%j", 86400, False)),
-    *(("%Y%j%H%M", 900, False), ("%Y-%j %H:%M", 900, False), ("%Y/%jT%H:%M:%S", 20, False)),
+    ("%Y%j%H%M", 900, False),
     *(("%y%m%d%H%M", 300, True), ("%y%m%d%H%M%S", 45, True)),
     *(("%H%M%S", dt, True) for dt in (1, 30, 600)),
     *(("%H%M", 300, True), ("%H:%M", 900, False), ("%H:%M:%S", 45, False)),

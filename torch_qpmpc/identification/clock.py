@@ -32,7 +32,6 @@ DAYS = (("yyyymmdd", "%Y%m%d", True), ("yyyyddd", "%Y%j", True), ("yymmdd", "%y%
 CLOCKED, PAIRS = "HHMMSS", ((3600, 25), (60, 60), (1, 60))
 DAY, HOUR = 86400.0, 3600.0
 CLOCK = re.compile(r"(\d+):(\d\d)(?::(\d\d))?(?:[.,](\d+))?(?:\s*([ap])\.?m\.?)?", re.IGNORECASE)
-YEAR_AND_DAY = r"((?:19|20)\d\d)[-/. ](\d{3})(?:[T ]+(.*))?"
 #: What no date has; pandas reads much else as a time difference.
 DIFFERENCE = r"\d\s*(?:days?|hours?|min|minutes?|seconds?|[dhms]|ms|us|ns)\b|^-?P\d"
 #: Midnight as the end of a day.
@@ -203,13 +202,7 @@ def _of_texts(texts: pd.Series, day_first: bool | None) -> Iterator[Reading]:
             return
     ended = texts.str.contains(MIDNIGHT)
     texts = texts.str.replace(MIDNIGHT, "00:00", regex=True)
-    parts = texts.str.extract(f"^{YEAR_AND_DAY}$")
-    name = "dates"
-    if parts[0].notna().all():
-        name = "year and day"
-        days = pd.to_datetime(parts[0] + parts[1], format="%Y%j", errors="coerce")
-        texts = days.dt.strftime("%Y-%m-%d ") + parts[2].fillna("00:00")
-    ways: dict[str, dict[str, Any]] = {name: {"format": "ISO8601"}}
+    ways: dict[str, dict[str, Any]] = {"dates": {"format": "ISO8601"}}
     ways |= {
         f"dates, {part} first": {"dayfirst": part == "day"}
         for part in ("day", "month")
