@@ -199,7 +199,6 @@ def test_bad_arguments_are_named(arguments):
 
 
 @refused(
-    ({"z": 1.0}, "signals: got 'z', expected some of u_last, known"),
     ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected 1 entries"),
     ({"known": np.ones((3, 2))}, "known: .* expected 0 entries"),
     ({"target": [1.0, 2.0]}, r"r: got shape \(2,\), expected 1 entries"),

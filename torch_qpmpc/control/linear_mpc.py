@@ -278,24 +278,24 @@ class LinearMPC:
 
         return aimed(self.design, torch, solve, s)
 
-    def arrange(self, x: Any, target: Target, **signals: Any) -> Tensor:
+    def arrange(self, x: Any, target: Target, u_last: Any = None, known: Any = None) -> Tensor:
         """Return p ``(*batch, n_p)`` in float64.
 
         Args:
             x: the state, ``(*batch, n)``.
             target: the `target` of the last stage; if the design is `staged`, one for each stage,
                 ``(*batch, N + 1, ..)``.
-            signals: ``u_last`` ``(*batch, m)``, u_s if left out, and ``known``
-                ``(*batch, N + 1, n_d)``, by default zero, and bounds as `Design.nominal`.
+            u_last: the last input, ``(*batch, m)``, by default u_s.
+            known: ``(*batch, N + 1, n_d)``, by default zero, and bounds as `Design.nominal`.
 
         Raises:
-            QPError: a name or a shape is wrong.
+            QPError: a shape is wrong.
         """
-        if unknown := sorted(signals.keys() - {"u_last", "known"}):
-            raise QPError.expected("signals", repr(unknown[0]), "some of u_last, known")
         design, (n, m, n_y, n_d) = self.design, self.design.plant.sizes
-        last, stages = target.u[..., -1, :] if design.staged else target.u, [self.horizon + 1]
-        values = {"x": x, "known": torch.from_numpy(design.nominal), "u_last": last, **signals}
+        if u_last is None:
+            u_last = target.u[..., -1, :] if design.staged else target.u
+        known = torch.from_numpy(design.nominal) if known is None else known
+        values, stages = {"x": x, "known": known, "u_last": u_last}, [self.horizon + 1]
         values |= {f"target.{name}": part for name, part in target._asdict().items()}
         shapes = [[n], [*stages, n_d], [m]]
         shapes += [[*stages * design.staged, size] for size in (n, m, n_y, n_y)]
