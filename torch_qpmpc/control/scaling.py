@@ -5,6 +5,7 @@ A change of units multiplies a signal and its size alike, so it changes no decis
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 from typing import NamedTuple
 
@@ -80,38 +81,29 @@ class Scaling(NamedTuple):
     def plant(self, plant: StateSpace) -> StateSpace:
         """Return a plant in signals divided by their sizes."""
         y, u, x, d = self
-        matrices = (
-            plant.A * (x / x[:, None]),
-            plant.B * (u / x[:, None]),
-            plant.C * (x / y[:, None]),
-            plant.E * (d / x[:, None]),
-            plant.offset / x,
-        )
         noise, visited = plant.noise, plant.visited
         if noise is not None:
             noise = noise[0] * (y / x[:, None]), noise[1] / y / y[:, None]
         if visited is not None:
             visited = visited[0] / x, visited[1] / x / x[:, None]
-        names = plant.inputs, plant.outputs, plant.known
-        A, B, C, E, offset = map(but_rounding, matrices)
-        drifts = plant.drifts / np.concatenate((x, y))[:, None]
-        log = {"noise": noise, "visited": visited, "drifts": drifts}
-        return StateSpace(A, B, C, E, offset, None, *names, **log)
+        sizes = {"A": (x, x), "B": (u, x), "C": (x, y), "E": (d, x)}
+        parts = {
+            name: but_rounding(getattr(plant, name) * (of / row[:, None]))
+            for name, (of, row) in sizes.items()
+        }
+        parts |= {"offset": but_rounding(plant.offset / x), "noise": noise, "visited": visited}
+        return replace(plant, **parts, drifts=plant.drifts / np.concatenate((x, y))[:, None])
 
-    def at_rest(
-        self, plant: StateSpace, u: Array, d: Array, y: Array | None = None, weight: float = 1.0
-    ) -> Array:
+    def at_rest(self, plant: StateSpace, u: Array, d: Array, y: Array, weight: float) -> Array:
         """Return the state ``(n,)`` that rests with the input u and the known signals d.
 
-        With outputs y it is as near to rest, and to y with a weight, as least squares allow: the
-        input alone does not determine the outputs of a plant that integrates, or nearly so.
+        It is as near to rest, and to outputs y with a weight, as least squares allow: the input
+        alone does not determine the outputs of a plant that integrates, or nearly so.
         """
         normal = self.plant(plant)
-        still = np.eye(len(normal.A)) - normal.A
+        still = np.vstack((np.eye(len(normal.A)) - normal.A, weight * normal.C))
         driven = normal.B @ (u / self.u) + normal.E @ (d / self.d) + normal.offset
-        if y is not None:
-            still = np.vstack((still, weight * normal.C))
-            driven = np.concatenate((driven, weight * y / self.y))
+        driven = np.concatenate((driven, weight * y / self.y))
         return self.x * np.linalg.lstsq(still, driven, rcond=None)[0]
 
 
