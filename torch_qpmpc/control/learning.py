@@ -104,22 +104,15 @@ def learn(
     check_whole("pairs", pairs, FEWEST)
     check_seed(seed)
     if hasattr(source, "reset"):
-        middle = law.read_set_points(r, 1, memory.r)[0]
-        size, name = _sizes(law.design, spread, SMALL * law.design.usual), "the environment"
-
-        def run(law: Law, entropy: tuple[int, ...]) -> Run:
-            rng = np.random.default_rng(entropy)
-            options = {"seed": int(rng.integers(2**31)), "known": known}
-            levels = _levels(law.design, middle, size, steps, rng)
-            return simulate(law, memory, source, steps, levels, **options)
-
-        loop, log = run, _gathered(run, law, -(-transitions // steps), seed)
+        middle, name = law.read_set_points(r, 1, memory.r)[0], "the environment"
+        around = middle, _sizes(law.design, spread, SMALL * law.design.usual)
+        loop = _loops(law.design, memory, source, around, steps, known=known)
+        log = _gathered(loop, law, -(-transitions // steps), seed)
     elif known is not None:
         raise QPError.expected("known", "signals beside a log", "None: the log has its own")
     else:
         log, held_out = _parts(_checked(as_log(source), law.design.plant))
-        middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
-        loop, name = _with_log(law.design, memory, held_out, middle, spread, steps), LAST
+        loop, name = _with_log(law, memory, held_out, r, spread, steps), LAST
     model = _identified(log, law.design.plant)
     candidate = _with_model(law, model)
     test, costs = _compare(loop, law, candidate, pairs, seed)
@@ -128,38 +121,47 @@ def learn(
     return LearningReport(*shown, steps, log.steps, name, model), candidate
 
 
-def _with_log(
-    design: Design, memory: Memory, held_out: Log, middle: Any, spread: Any, steps: int
-) -> Loop:
+def _with_log(law: Law, memory: Memory, held_out: Log, r: Any, spread: Any, steps: int) -> Loop:
     """Return loops with a model of a part of a log, at its levels, with its known signals."""
+    design, around = law.design, _set_points(law, memory, held_out, r, spread)
     identified = _identified(held_out, design.plant)
     if (share := explained_by_inputs(identified.model, held_out.trajectories).max()) > FED_BACK:
         got = f"inputs in the last third that follow the outputs alone by {share:.0%}"
         remedy = "Move the set-points, or add a random signal to the inputs."
         raise QPError.expected("log", got, "some that also move by themselves", remedy)
     d = torch.cat([one.d for one in held_out.trajectories]).numpy()
-    middle, size = _set_points(design, held_out, middle, spread)
     model = read_model(identified, prices=design.linear.values())
     own = replace(design, plant=model, disturbances=choose(model, None))
-    x, u, *_ = LinearMPC.of_design(own).target(middle, known=d.mean(0))
+    x, u, *_ = LinearMPC.of_design(own).target(around[0], known=d.mean(0))
     rest = {"x": x.numpy(), "u": u.numpy(), "noise": np.sqrt(np.diag(identified.fit.model.S))}
+    return _loops(design, memory, model, around, steps, d, **rest)
+
+
+def _loops(
+    design: Design, memory: Memory, plant: Any, around: Any, steps: int, d: Any = None, **rest: Any
+) -> Loop:
+    """Return loops with set-points ``around`` a middle, each held for half a horizon."""
+    (middle, size), hold = around, max(design.horizon // 2, 1)
 
     def loop(law: Law, entropy: tuple[int, ...]) -> Run:
         rng = np.random.default_rng(entropy)
-        noise = int(rng.integers(2**31))
-        levels = _levels(design, middle, size, steps, rng)
-        start = int(rng.integers(max(len(d) - steps, 1)))
-        known = d[np.minimum(start + np.arange(steps), len(d) - 1)]
-        return simulate(law, memory, model, steps, levels, seed=noise, known=known, **rest)
+        seed = int(rng.integers(2**31))
+        levels = middle + size * rng.uniform(-1, 1, (-(-steps // hold), len(middle)))
+        r = np.clip(levels, *design.y_bounds).repeat(hold, axis=0)
+        if d is not None:
+            start = int(rng.integers(max(len(d) - steps, 1)))
+            rest["known"] = d[np.minimum(start + np.arange(steps), len(d) - 1)]
+        return simulate(law, memory, plant, steps, r, seed=seed, **rest)
 
     return loop
 
 
-def _set_points(design: Design, log: Log, middle: Any, spread: Any) -> tuple[Array, Array]:
+def _set_points(law: Law, memory: Memory, log: Log, r: Any, spread: Any) -> tuple[Array, Array]:
     """Return the middle of the set-points and their distances from it, by default the log's."""
     y = torch.cat([one.y for one in log.trajectories]).numpy()
-    middle = np.clip(np.nanmean(y, 0) if middle is None else middle, *design.y_bounds)
-    return middle, _sizes(design, spread, np.nanstd(y, 0))
+    middle = np.nanmean(y, 0) if r is None else law.read_set_points(r, 1, memory.r)[0]
+    sizes = _sizes(law.design, spread, np.nanstd(y, 0))
+    return np.clip(middle, *law.design.y_bounds), sizes
 
 
 def _sizes(design: Design, spread: Any, default: Array) -> Array:
@@ -169,15 +171,6 @@ def _sizes(design: Design, spread: Any, default: Array) -> Array:
     if not ((size > 0).any() and (size >= 0).all() and np.isfinite(size).all()):
         raise QPError.expected("spread", f"{size.tolist()}", "distances >= 0, not all of them 0")
     return size
-
-
-def _levels(
-    design: Design, middle: Array, size: Array, steps: int, rng: np.random.Generator
-) -> Array:
-    """Return rows of set-points within the bounds, each level held for half a horizon."""
-    hold = max(design.horizon // 2, 1)
-    levels = middle + size * rng.uniform(-1, 1, (-(-steps // hold), len(middle)))
-    return np.clip(levels, *design.y_bounds).repeat(hold, axis=0)
 
 
 def _gathered(loop: Loop, law: Law, loops: int, seed: int) -> Log:
@@ -266,8 +259,7 @@ def improve(
     check_whole("members", members, 1)
     check_seed(seed)
     log = _checked(as_log(source), law.design.plant)
-    middle = None if r is None else law.read_set_points(r, 1, memory.r)[0]
-    set_points = _set_points(law.design, log, middle, spread)
+    set_points = _set_points(law, memory, log, r, spread)
     models = ensemble(_identified(log, law.design.plant), members, seed)
     law = replace(law, mpc=copy.deepcopy(law.mpc))
     plan = law.mpc.plan
