@@ -29,10 +29,6 @@ class Trajectory(NamedTuple):
         """The number of steps, T."""
         return self.u.shape[0]  # len takes ten times as long
 
-    def between(self, start: int, stop: int) -> Trajectory:
-        """Return the steps start, .., stop - 1."""
-        return Trajectory(self.y[start : stop + 1], self.u[start:stop], self.d[start:stop])
-
 
 @dataclass(frozen=True, eq=False)
 class Log:
@@ -99,9 +95,10 @@ def folds(trajectories: Sequence[Trajectory], count: int) -> list[list[Trajector
     bounds = [total * i // count for i in range(count + 1)]
     parts: list[list[Trajectory]] = [[] for _ in range(count)]
     for trajectory in trajectories:
+        y, u, d = trajectory
         for part, first, last in zip(parts, bounds[:-1], bounds[1:], strict=True):
             start, stop = max(first - begin, 0), min(last - begin, trajectory.steps)
             if start < stop:
-                part.append(trajectory.between(start, stop))
+                part.append(Trajectory(y[start : stop + 1], u[start:stop], d[start:stop]))
         begin += trajectory.steps
     return parts
