@@ -145,14 +145,11 @@ class Law:
             QPError: a deviation is invalid, or the model has no filter.
         """
         design, w = mpc.design, mpc.design.disturbances
-        share = np.full(len(design.usual), SMALL)
+        sizes, drifts = SMALL * design.usual, SMALL * design.of_w(design.usual)
         if design.plant.noise is not None:
-            share = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual))) / design.usual
-            drifts = moving(design, share * design.usual)
-            drifts = np.where(np.greater(w.changes, 0), w.changes, drifts)
-        else:
-            drifts = np.full(len(w.names), SMALL) * design.of_w(design.usual)
-        noise = _deviations("noise", noise, share * design.usual, design.plant.outputs)
+            sizes = np.sqrt(np.diag(floored(design.plant.noise[1], design.usual)))
+            drifts = np.where(np.greater(w.changes, 0), w.changes, moving(design, sizes))
+        noise = _deviations("noise", noise, sizes, design.plant.outputs)
         drift = _deviations("drift", drift, drifts, w.names)
         observer = kalman(design, noise, drift)
         observer = observer if gain is None else observer.with_gain(gain)
