@@ -157,8 +157,8 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
     target = target.masked_fill(held, 0.0)
     target = target if cost is None else torch.cat((target, cost.double().unsqueeze(-1)), -1)
     v = (v - middle) / size
-    features = _features(v, cost is not None)
-    linear = features[:, : 1 + v.shape[1]]
+    linear = torch.cat((torch.ones_like(v[:, :1]), v), 1)
+    features = linear if cost is None else torch.cat((linear, _products(v)), 1)
     base = F.pad(ridge(linear, target[:, :n_x]), (0, 0, 0, features.shape[1] - linear.shape[1]))
     if cost is not None:
         base = torch.cat((base, _convex(linear, features, target[:, n_x:])), -1)
@@ -178,12 +178,6 @@ def fit_learned(v: Tensor, x: Tensor, after: Tensor, cost: Tensor | None = None)
         last = W * spread * used, (b * spread + mean) * used
         layers, base = (*hidden, *last) if used.any() else (), base * ~used
     return LearnedModel(middle, size, base, n_x, layers, left)
-
-
-def _features(v: Tensor, products: bool) -> Tensor:
-    """Return 1, v ``(.., n)`` and, with ``products``, those of its entries."""
-    parts = torch.ones_like(v[..., :1]), v, *([_products(v)] if products else [])
-    return torch.cat(parts, -1)
 
 
 def _products(v: Tensor) -> Tensor:
