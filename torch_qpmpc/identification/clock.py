@@ -83,7 +83,9 @@ def seconds(column: pd.Series, day_first: bool | None) -> tuple[np.ndarray, str,
         got = f"{name}, empty in {empty} of {len(column)} rows"
         raise QPError.expected("time", got, "times in two rows or more", "Omit time=.")
     if not readings:
-        got = f"{name} with {_odd(column)!r}"
+        texts = column.dropna().astype(str)
+        unread = texts[pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).isna()]
+        got = f"{name} with {[*unread, *texts][0]!r}"  # the first that is no date in any way
         raise QPError.expected("time", got, "numbers or dates of one format")
     best = min(reading.uneven for reading in readings) + SAME
     chosen = next(reading for reading in readings if reading.uneven <= best)
@@ -150,12 +152,12 @@ def _readings(column: pd.Series, day_first: bool | None) -> Iterator[Reading]:
 
 
 def _of_numbers(numbers: np.ndarray) -> Iterator[Reading]:
-    """Yield the readings of numbers: days by their digits, themselves, and rarer clocks."""
+    """Yield the readings of numbers: days by their digits, themselves, and rarer ones."""
     known = np.isfinite(numbers)
     if not known.any():
         return
     whole = np.floor(np.where(known, numbers, numbers[known].min()))
-    rest, later = numbers - whole, []
+    rest, found = numbers - whole, list[Reading]()
     for name, written, sure in DAYS:
         for pairs in range(4):
             days, clock = np.divmod(whole, 100**pairs)
@@ -166,16 +168,12 @@ def _of_numbers(numbers: np.ndarray) -> Iterator[Reading]:
             dates = pd.to_datetime(texts, format=written, errors="coerce")
             if dates.dt.year.between(1900, 2100).all():  # none is NaT
                 times = _since_first(dates) + times + rest
-                reading = Reading(name + CLOCKED[: 2 * pairs], times, guess=not sure)
-                if sure:
-                    yield reading
-                else:
-                    later.append(reading)
-    yield Reading(NUMBERS, numbers)
-    yield from later
+                found.append(Reading(name + CLOCKED[: 2 * pairs], times, guess=not sure))
+    found.append(Reading(NUMBERS, numbers))
     for pairs in (2, 3):
         if (times := _of_pairs(whole, pairs)) is not None:
-            yield Reading(CLOCKED[: 2 * pairs], times + rest, DAY, guess=True)
+            found.append(Reading(CLOCKED[: 2 * pairs], times + rest, DAY, guess=True))
+    yield from sorted(found, key=lambda reading: reading.guess)
 
 
 def _of_pairs(digits: np.ndarray, pairs: int) -> np.ndarray | None:
@@ -243,13 +241,6 @@ def _since_first(dates: pd.Series) -> np.ndarray:
     if dates.dtype.kind != "m":
         dates = dates - dates.min()
     return dates.dt.total_seconds().to_numpy()
-
-
-def _odd(column: pd.Series) -> str:
-    """Return the first entry that is no date in any way."""
-    texts = column.dropna().astype(str)
-    unread = texts[pd.to_datetime(texts, errors="coerce", format="mixed", utc=True).isna()]
-    return str([*unread, *texts][0])
 
 
 def gaps_of(
