@@ -136,7 +136,7 @@ def test_signals_may_be_as_large_as_bounds_noise_and_effects_make_usual():
         controller.reset([0.0], known=[4e11, 0.0, 0.0])
     assert controller.step([0.0], [0.0], known=[4e11, 0.0, 0.0]) == controller.u
     assert controller.status.name == "INVALID"
-    assert controller.known is None
+    assert controller._memory.known is None
     assert np.isfinite(controller.step([1e8], [1e8], known=[1e11, 1e6, 1e30])).all()
 
 

@@ -156,11 +156,6 @@ class Controller:
         """The set-points of the last step."""
         return self._memory.r.copy()
 
-    @property
-    def known(self) -> Array | None:
-        """The known signals of the last step or reset."""
-        return None if self._memory.known is None else self._memory.known.copy()
-
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
         """Return the input for measured outputs: a vector ``(m,)``, or by name if y is by name.
 
