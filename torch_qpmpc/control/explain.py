@@ -73,9 +73,8 @@ class Explanation:
             for k in 1 + changed[:1] if levels else ():
                 to = "off" if decided[k] < np.mean(levels[:2]) else f"to {decided[k]:.4g}"
                 lines.append(f"{name} goes {to} in {k} step{'s' * bool(k > 1)}")
-        for name, x in self.disturbances.items():
-            unit = plant.units.get(name.removeprefix(PREFIX), "")
-            lines.append(f"{name} {x:.4g} {unit}".rstrip())
+        of_w = {name.removeprefix(PREFIX): x for name, x in self.disturbances.items()}
+        lines += [f"{PREFIX}{plant.quantity(name, x)}" for name, x in of_w.items()]
         free = ["No bound holds the plan back."] * (self.status in PLANNED)
         return "\n".join([*lines, *([x.text for x in self.limits] or free), self.reach])
 
