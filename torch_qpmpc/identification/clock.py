@@ -7,7 +7,6 @@ A column may have several readings: 20260301 is a number or a day, 10:30 has hou
 from __future__ import annotations
 
 import contextlib
-import re
 import warnings
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -31,7 +30,7 @@ DAYS = (("yyyymmdd", "%Y%m%d", True), ("yyyyddd", "%Y%j", True), ("yymmdd", "%y%
 #: The pairs of digits of a time of day, the seconds of each, and the first that it cannot be.
 CLOCKED, PAIRS = "HHMMSS", ((3600, 25), (60, 60), (1, 60))
 DAY, HOUR = 86400.0, 3600.0
-CLOCK = re.compile(r"(\d+):(\d\d)(?::(\d\d))?(?:[.,](\d+))?(?:\s*([ap])\.?m\.?)?", re.IGNORECASE)
+CLOCK = r"(?i)^(\d+):(\d\d)(?::(\d\d))?(?:[.,](\d+))?(?:\s*([ap])\.?m\.?)?$"
 #: What no date has; pandas reads much else as a time difference.
 DIFFERENCE = r"\d\s*(?:days?|hours?|min|minutes?|seconds?|[dhms]|ms|us|ns)\b|^-?P\d"
 #: Midnight as the end of a day.
@@ -189,9 +188,8 @@ def _of_pairs(digits: np.ndarray, pairs: int) -> np.ndarray | None:
 
 
 def _of_texts(texts: pd.Series, day_first: bool | None) -> Iterator[Reading]:
-    clocks = [CLOCK.fullmatch(x) for x in texts]
-    if all(clocks):
-        yield from _of_clocks([x.groups() for x in clocks if x])
+    if (clocks := texts.str.extract(CLOCK))[0].notna().all():
+        yield from _of_clocks(clocks)
         return
     if texts.str.contains(DIFFERENCE, case=False).any():
         differences = pd.to_timedelta(texts, errors="coerce")
@@ -215,21 +213,22 @@ def _of_texts(texts: pd.Series, day_first: bool | None) -> Iterator[Reading]:
                 return
 
 
-def _of_clocks(parts: list[tuple[str | None, ...]]) -> Iterator[Reading]:
+def _of_clocks(parts: pd.DataFrame) -> Iterator[Reading]:
     """Yield the readings of a:bb, a:bb.c, a:bb:cc, a:bb:cc.d, with am or pm or without."""
-    a, b, c = (np.array([float(x[i] or 0) for x in parts]) for i in range(3))
-    rest = np.array([float(f"0.{x[3] or 0}") for x in parts])
-    if {x[2] is None for x in parts} == {True, False} or (b >= 60).any() or (c >= 60).any():
+    a, b, c = parts[[0, 1, 2]].fillna("0").to_numpy(float).T
+    rest = ("0." + parts[3].fillna("0")).to_numpy(float)
+    long, split, halves = (parts[i].notna() for i in (2, 3, 4))
+    if long.nunique() > 1 or (b >= 60).any() or (c >= 60).any():
         return
-    if any(x[4] for x in parts):
-        a = a % 12 + np.array([12.0 * ((x[4] or "").lower() == "p") for x in parts])
+    if halves.any():
+        a = a % 12 + 12.0 * (parts[4].str.lower() == "p").to_numpy()
     elapsed = (a > 24).any()
     hours = HOUR * a + 60 * b + c + rest
-    if parts[0][2] is not None or any(x[4] for x in parts):
+    if long.all() or halves.any():
         yield Reading("h:mm:ss", hours, np.inf if elapsed else DAY)
         return
     minutes = Reading("mm:ss", 60 * a + b + rest, np.inf if (a >= 60).any() else HOUR)
-    if any(x[3] is not None for x in parts):  # as spreadsheets show, without the hours
+    if split.any():  # as spreadsheets show, without the hours
         yield minutes
         return
     either = Reading("h:mm", hours, np.inf if elapsed else DAY), minutes
