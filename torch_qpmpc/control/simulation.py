@@ -127,8 +127,8 @@ def closed_loop(
         model = design.plant if plant is None else read_model(plant)
         own = _known(model, design, d)
         scaling = Scaling.of(model, design.y_bounds, design.u_bounds, design.Q)
-        held, y = (u, own[0]), memory.rest[0]
-        y, near = (np.zeros(len(model.C)), 0.0) if y is None else (y, near)
+        held, aim = (u, own[0]), memory.rest[0]
+        y, near = (np.zeros(len(model.C)), 0.0) if aim is None else (aim, near)
         rest = scaling.at_rest(model, *held, y, near)
         if model.dynamics is not None:
             rest = settled(

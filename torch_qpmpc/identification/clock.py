@@ -217,8 +217,8 @@ def _of_clocks(parts: pd.DataFrame) -> Iterator[Reading]:
     """Yield the readings of a:bb, a:bb.c, a:bb:cc, a:bb:cc.d, with am or pm or without."""
     a, b, c = parts[[0, 1, 2]].fillna("0").to_numpy(float).T
     rest = ("0." + parts[3].fillna("0")).to_numpy(float)
-    long, split, halves = (parts[i].notna() for i in (2, 3, 4))
-    if long.nunique() > 1 or (b >= 60).any() or (c >= 60).any():
+    long, split, halves = parts[[2, 3, 4]].notna().to_numpy().T
+    if long.any() != long.all() or (b >= 60).any() or (c >= 60).any():
         return
     if halves.any():
         a = a % 12 + 12.0 * (parts[4].str.lower() == "p").to_numpy()
