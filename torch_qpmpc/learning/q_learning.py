@@ -217,9 +217,9 @@ class QPQLearningLoss(LossModule):
         value_type, options = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if options is None:
             return self
-        options |= {"tensor_keys": self._estimator_keys(), "value_network": self.state_value_network}
-        options |= {"supported": self.SUPPORTED_VALUE_ESTIMATORS}
-        dispatch_value_estimator(self, value_type, **options)
+        network, supported = self.state_value_network, self.SUPPORTED_VALUE_ESTIMATORS
+        options |= {"tensor_keys": self._estimator_keys(), "supported": supported}
+        dispatch_value_estimator(self, value_type, value_network=network, **options)
         return None
 
     @dispatch()
