@@ -360,6 +360,15 @@ def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_ce
 
 
 @needs_compiler
+def test_a_policy_whose_actions_are_mostly_zero_is_exported(tmp_path):
+    """Rounding of zero is no error beside the actions at the ends of the zone."""
+    model = ([[1.0]], [[0.5]])
+    mpc = qm.LinearMPC(model, 4, R=1.0, y_bounds=(-300.0, 1e10), u_bounds=(-1.5, 1.0))
+    for policy in (mpc.plan, mpc.targets):
+        export_c(policy, tmp_path)
+
+
+@needs_compiler
 def test_actions_that_differ_at_any_state_are_refused(tmp_path, monkeypatch):
     steps = Library.steps
 

@@ -209,8 +209,9 @@ def choose(mpc: QPMPC, p: Array, coarse: BatchSolution) -> tuple[Examples, Batch
 
 
 def _size(x: Array, solved: Array) -> Array:
-    """Return a typical size of the solved x: those of far states are larger."""
-    return np.quantile(np.abs(x[solved]), 0.9, axis=0) if solved.any() else np.ones(x.shape[1:])
+    """Return a typical size of the solved x: those of far states are larger, most may be zero."""
+    sizes = np.abs(x[solved]) if solved.any() else np.ones((1, *x.shape[1:]))
+    return np.fmax(np.quantile(sizes, 0.9, axis=0), 1e-3 * sizes.max(0)).clip(1e-9)
 
 
 def compare(
@@ -233,7 +234,7 @@ def compare(
     u, value = differences(exact)
     # Relative to the state's own action, or to a usual one: some drawn states have huge ones.
     sizes = np.abs(actions(mpc, exact)).max(-1)
-    sizes = np.fmax(sizes, np.median(sizes[both]) if both.any() else 0).clip(1e-9)
+    sizes = np.fmax(sizes, _size(sizes, both))
     doubtful = both & ((u > DOUBTFUL * sizes) | (value > DOUBTFUL))
     if library.real == np.float64:
         u, value = differences(sharpen(mpc, p, exact, np.flatnonzero(doubtful)))
@@ -249,8 +250,7 @@ def compare(
     errors = np.where(both, u / sizes, 0)
     for i in np.flatnonzero(errors > NEAR[str(library.real)]):
         lam = library.multipliers(states, len(tables.Q))[i]
-        if u[i] <= _tolerance(tables, str(library.real), p[i], lam):
-            errors[i] = 0
+        errors[i] *= u[i] > _tolerance(tables, str(library.real), p[i], lam)
     return agreement, float(errors.max(initial=0))
 
 
