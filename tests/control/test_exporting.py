@@ -233,6 +233,11 @@ def test_a_self_test_replays_the_steps_whose_inputs_rounding_hardly_changes(tmp_
     (replayed,) = re.findall(r"#define EXAMPLES (\d+)", (tmp_path / "policy.c").read_text())
     assert 2 < int(replayed) < exporting.REPLAYED
     assert load(files, controller).selftest() == 0
+    file = tmp_path / "policy.c"  # C's own errors in the first steps are larger than rounding
+    before, y, after = re.split(r"(?<=EXAMPLE_Y)(.*?;)", file.read_text(), maxsplit=1, flags=re.S)
+    y = re.sub(r"\d\.\d+(e[-+]\d+)?", lambda x: repr(float(x[0]) * (1 + 1e-10)), y)
+    file.write_text(before + y + after)
+    assert load(files, controller).selftest() == 0
 
 
 @pytest.mark.parametrize(

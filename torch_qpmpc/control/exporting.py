@@ -247,7 +247,7 @@ def _replayed(law: Law, loop: Loop, dtype: str) -> Loop:
 
     A controller that is unstable on its own enlarges rounding as its inputs move no plant here.
     """
-    rounding = 8 * np.finfo(dtype).eps * np.random.default_rng(0).choice([-1, 1], loop.y.shape)
+    rounding = 1e-4 * NEAR[dtype] * np.random.default_rng(0).choice([-1, 1], loop.y.shape)
     near = 0.01 * NEAR[dtype] * law.design.scaling.u
     policy = law.policy(law.begun(loop.start[0]))
     for k, (y, r, known, u) in enumerate(zip(*loop[:4], strict=True)):
