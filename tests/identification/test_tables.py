@@ -122,7 +122,13 @@ def test_a_file_is_read_by_its_header(tmp_path, lines, steps):
 
 @pytest.mark.parametrize(
     ("sep", "decimal", "encoding"),
-    [(";", ",", "utf-8"), (";", ",", "cp1252"), (";", ".", "utf-8-sig"), ("\t", ",", "utf-8")],
+    [
+        (";", ",", "utf-8"),
+        (";", ",", "cp1252"),
+        (";", ".", "utf-8-sig"),
+        ("\t", ",", "utf-8"),
+        ("\t", ",", "utf-16"),
+    ],
 )
 def test_a_file_of_another_country_is_read(tmp_path, sep, decimal, encoding):
     frame = room().rename(columns={"T": "T [°C]", "t": "t [h]"})
@@ -282,6 +288,20 @@ def set_point(rows: int) -> dict[str, np.ndarray]:
         u[k] = 2 * (r[k] - y[k])
         y[k + 1] = 0.9 * y[k] + 0.1 * u[k] + 0.1 * rng.normal()
     return {"y1": y, "y2": r, "u": u}
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "units"),
+    [
+        ("T[0] [degC]", "T[0]", {"T[0]": "degC"}),
+        ("T [degC] raw", "T [degC] raw", {}),
+        (("T", "degC"), ("T", "degC"), {}),
+    ],
+)
+def test_a_unit_is_the_last_part_of_a_header_in_brackets(header, name, units):
+    rows = pd.DataFrame({header: np.arange(9.0), "q": np.arange(9.0) ** 2})
+    log = qm.read_log(rows, outputs=[name], inputs="q")
+    assert (log.outputs, log.units) == ((str(name),), units)
 
 
 @pytest.mark.filterwarnings("error")

@@ -27,7 +27,7 @@ FAR, FEW, OFTEN = 10, 0.05, 0.9
 #: The column of a DataFrame's index of times, and the one of an index in a file, by pandas.
 TIME_INDEX, FILE_INDEX = "the index", "Unnamed: 0"
 #: A column's header with its unit, as in ``T [degC]``.
-HEADER = re.compile(r"\s*(.*?)\s*\[(.*)\]\s*")
+HEADER = re.compile(r"\s*(.*?)\s*\[([^][]*)\]\s*$")
 KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
 
 
@@ -45,7 +45,7 @@ def read_tables(
     marks = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
     headers, units = _name_columns(frames)
     frame = pd.concat(frames, ignore_index=True)
-    listed = [x if x is None else np.atleast_1d(x).astype(str).tolist() for x in signals]
+    listed = [x if x is None else [*map(str, [x] if isinstance(x, str) else x)] for x in signals]
     chosen = [x and [headers.get(name.strip()) or name for name in x] for x in listed]
     time, episode = (x if x is None else headers.get(str(x).strip(), x) for x in (time, episode))
     taken = {time, episode, *(name for names in chosen for name in names or ())}
@@ -107,7 +107,7 @@ def _frame(part: Any) -> pd.DataFrame:
             return _read_csv(Path(part))
         except (OSError, ValueError, Warning) as error:
             got = f"{part}, which cannot be read ({error})"
-            raise QPError.expected("data", got, "a CSV file") from error
+            raise QPError.expected("data", got, "a CSV file that begins with a header") from error
     if isinstance(part, pd.DataFrame):
         timed = isinstance(part.index, pd.DatetimeIndex | pd.TimedeltaIndex | pd.PeriodIndex)
         return part.assign(**{TIME_INDEX: part.index}) if timed else part.copy()
@@ -138,8 +138,9 @@ def _read_csv(path: Path) -> pd.DataFrame:
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        text = path.read_text(encoding="cp1252")
+    except UnicodeDecodeError as error:
+        is_utf_16 = error.object[:2] in (b"\xff\xfe", b"\xfe\xff")
+        text = path.read_text(encoding="utf-16" if is_utf_16 else "cp1252")
     headers = {}
     for sep in ",;\t":
         rows = csv.reader(io.StringIO(text), delimiter=sep, skipinitialspace=True)
@@ -164,11 +165,10 @@ def _name_columns(frames: Sequence[pd.DataFrame]) -> tuple[dict[str, str], dict[
     headers, units = dict[str, str](), dict[str, str]()
     for frame in frames:
         bare, names = [_bare(x) for x in frame.columns], []
-        for i, (header, name) in enumerate(zip(map(str, frame.columns), bare, strict=True)):
-            header = header.strip()
-            name = name if bare.count(name) == 1 else header
-            names.append(name or f"Unnamed: {i}")
-            headers.setdefault(header, names[-1])
+        for header, name in zip(map(str, frame.columns), bare, strict=True):
+            name = name if bare.count(name) == 1 else header.strip()
+            names.append(name or f"Unnamed: {len(names)}")
+            headers.setdefault(header.strip(), names[-1])
             unit = match[2] if (match := HEADER.fullmatch(header)) else None
             if unit is not None and units.setdefault(name, unit) != unit:
                 got = f"{name} in {units[name]} and in {unit}"
