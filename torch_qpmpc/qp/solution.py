@@ -47,8 +47,8 @@ class QPSolution:
         status: `Status` as integers, ``(*batch,)``.
         residual: relative KKT residual, from the certificate, ``(*batch,)``.
         value_error: bound of the error of ``value``, relative to the largest of 1/2 z'Hz, q'z,
-            w'sigma and their sum (but to no more than 1e3 times the sum), or to a millionth of
-            |Hz + q|'(ub - lb), of entries with hard bounds, if that is larger, ``(*batch,)``.
+            w'sigma and their sum (but to no more than 1e3 times the sum), or, if larger, to 1e-6 of
+            |Hz + q|'(ub - lb), of entries with hard bounds, or 1e-8 of all terms, ``(*batch,)``.
         iterations: the solver's iterations, ``(*batch,)``.
         active: the active set as int8 ``(*batch, n_g)``, a warm start for a nearly equal QP. Rows
             are 0 without a multiplier, 1 if held at ub, -1 if held at lb, 2 and -2 if saturated

@@ -40,6 +40,18 @@ def test_the_value_does_not_depend_on_the_plants_unit(solver, unit):
     assert solution.value_error <= 1e-6
 
 
+def test_a_cost_of_zero_with_actuators_to_spare_is_right_to_rounding(solver):
+    """Two actuators hold one output at its set-point: V = 0, and H is flat in the others' plans."""
+    A, B = [[0.8, 0.1, 0.0], [0.05, 0.7, 0.0], [0.0, 0.0, 1.0]], [[0.3, 0.17], [0.11, 0.4], [0, 0]]
+    error = torch.tensor([0.73, 0.41, -1.0, 0.0, 0.0], dtype=torch.float64)  # y - r
+    options: dict[str, Any] = {"stage_weight": error.outer(error), "hessian": "block"}
+    options |= {"action_bounds": ([-9.0] * 2, [9.0] * 2), "solver": solver}
+    mpc = QPMPC.from_model(A, B, 5, **options)
+    x = torch.tensor([[0.3, -0.7], [1.1, 0.9], [0.47, 0.13]], dtype=torch.float64)
+    s = torch.cat((x, x @ error[:2, None]), -1)
+    assert_close(mpc.value(s), torch.zeros(3).double(), rtol=0, atol=1e-12)
+
+
 @functools.cache
 def parallel(seed: int) -> Case:
     return parallel_rows(Draw(seed), 16)

@@ -32,6 +32,8 @@ MAX_PASSES = 15
 EXACT = 1e-20
 #: .. or by more than this if active rows are equal up to rounding.
 ROUNDING = 1e-14
+#: Sizes count as at least this share of the largest, or of all terms: less may be rounding.
+LEAST = ROUNDING / TOLERANCE
 #: Rows are dependent if a singular value, relative to the largest, is below this, ..
 SINGULAR = 2e-15
 #: .. and H is flat in a direction whose curvature is, relative to its largest entry.
@@ -254,31 +256,29 @@ class _Point(NamedTuple):
         n_z, n_c, hard = len(z), len(qp.b), np.isinf(qp.w)
         beyond = np.maximum(np.maximum(self.y.minus(qp.ub), -self.y.minus(qp.lb)), 0)
         charge = np.where(hard, 0, qp.w * beyond)
-        half = Twice(self.slope.high / 2, self.slope.low / 2)
-        linear, quadratic = _dot(self.z, Twice(qp.q, 0 * qp.q)), _dot(self.z, half)
+        linear, quadratic = _dot(self.z, Twice(qp.q, 0 * qp.q)), _dot(self.z, self.slope) / 2
         cost = linear + quadratic + charge.sum()
         scale = max(map(abs, (cost, linear, quadratic, charge.sum())))
-        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
         bound = np.where(lam > 0, qp.ub, np.where(lam < 0, qp.lb, 0))
         gap = np.where(lam == 0, charge, charge - lam * self.y.minus(bound))
         of_slope, of_C, _ = np.split(np.abs(errors), (n_z, n_z + n_c))
         slip = of_slope @ np.abs(z) + np.abs(gap).sum() + of_C @ np.abs(chi)
         force = np.stack((np.abs(qp.H) @ np.abs(z) + np.abs(qp.q), np.abs(qp.G.T) @ np.abs(lam)))
         force = force.sum(0) + np.abs(qp.C.T) @ np.abs(chi)
+        scale = max(min(scale, CANCELLED * abs(cost)), FLOOR, LEAST * (force @ np.abs(z)))
         short = np.concatenate((np.abs(qp.C) @ np.abs(z) + np.abs(qp.b), _row_sizes(qp, z)))
         # Rows that contradict each other are held in the middle: no further than is infeasible.
         off = np.concatenate((of_C, hard * beyond)) * (TOLERANCE / CONTRADICTED)
-        residual = max(_ratio(of_slope, force), _ratio(off, short))
-        error = slip / scale
+        residual, error = max(_ratio(of_slope, force), _ratio(off, short)), slip / scale
         right = residual <= TOLERANCE and error <= TOLERANCE
         status = int(Status.SOLVED if right else Status.NOT_CONVERGED)
-        certificate = status, residual, error, sets
-        return BatchSolution(cost + qp.c, z, chi, lam, chi[n_c:], *certificate, self.codes)
+        xi, value = chi[n_c:], cost + qp.c
+        return BatchSolution(value, z, chi, lam, xi, status, residual, error, sets, self.codes)
 
 
 def _ratio(errors: np.ndarray, sizes: np.ndarray) -> float:
     """Return the largest relative error, without those of terms that all but vanish."""
-    least = max(ROUNDING * sizes.max(initial=0.0), FLOOR)
+    least = max(LEAST * sizes.max(initial=0.0), FLOOR)
     return float((errors / np.maximum(sizes, least)).max(initial=0.0))
 
 
