@@ -8,6 +8,7 @@ from torch.testing import assert_close
 
 from tests.problems import HARD_ROWS, SOFT_ROWS, known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, SolverError, Status, solve_qp
+from torch_qpmpc.qp.pipeline import solve
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.diagnosis import diagnose
 
@@ -89,6 +90,18 @@ def test_unsolvable_qps_are_diagnosed_quickly(solver, name, qp, status):
     assert time.process_time() - began < 2
     assert Status(int(solution.status)) == status
     assert solution.value == torch.inf
+
+
+def test_many_infeasible_qps_are_diagnosed_before_other_eliminations(solver, monkeypatch):
+    def slow(*_: Any) -> Any:
+        raise AssertionError
+
+    monkeypatch.setattr(solve, "OTHER_ELIMINATIONS", (slow,))
+    options: dict[str, Any] = {"stage_weight": [1.0, 0.1], "state_bounds": ([-1.0], [1.0])}
+    options |= {"state_slack": INF, "action_bounds": ([-1.0], [1.0]), "solver": solver}
+    mpc = QPMPC.from_model([[1.5]], [[1.0]], 3, on_failure="mask", **options)
+    s = torch.linspace(5, 6, 2 * solve.FEW)[:, None]
+    assert (mpc.solve(s).status == Status.INFEASIBLE).all()
 
 
 ROWS, EQUALITY = (UNIT, [-1, -1], [1, 1], [INF, 5]), {"C": [[1, 0]], "b": [1]}

@@ -279,8 +279,8 @@ def steps_of(
 ) -> list[Step]:
     """Return the steps of a solve of ``count`` QPs, each for those that the ones before leave.
 
-    Up to `FEW` QPs that the solver leaves are refined and diagnosed one by one at once; more of
-    them after other eliminations, which solve whole batches.
+    Up to `FEW` QPs that the solver leaves are refined one by one at once; more of them after other
+    eliminations, which solve whole batches, but cost more than a diagnosis.
     """
     others = (name for name in FALLBACKS if name != solver or name == FALLBACKS[-1])
     solves = BACKENDS.get(solver) or backend(solver), *map(BACKENDS.__getitem__, others)
@@ -294,10 +294,9 @@ def steps_of(
         partial(_if_few, refined),
         partial(_counted, log),
         _recalled,
-        partial(_if_few, _diagnosed),
+        _diagnosed,
         *(partial(_eliminated, way) for way in (*OTHER_ELIMINATIONS, None)),
         refined,
-        _diagnosed,
         *(step for other in others for step in (other, refined)),
         partial(_refined_last, log, last),
     ]
