@@ -169,7 +169,7 @@ def test_the_only_level_is_feasible_in_single_precision():
     levels = {"action_levels": [(0.1,)], "solver": "daqp"}
     mpc = qm.QPMPC.from_model([[0.9]], [[0.5]], 2, stage_weight=[1.0, 0.1], **levels)
     assert mpc.action_value(torch.ones(1), torch.tensor([0.1])).isfinite()
-    with pytest.raises(qm.SolverError, match=r"INFEASIBLE: .* check b, lb, ub and levels"):
+    with pytest.raises(qm.SolverError, match=r"INFEASIBLE: .* check s, a, b, lb, ub and levels"):
         mpc.action_value(torch.ones(1), torch.tensor([0.2]))
     one = "mpc: got one with levels, expected one without, for "
     with pytest.raises(qm.QPError, match=rf"{one}gradients of closed loops\. Without"):

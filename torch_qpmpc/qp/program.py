@@ -73,7 +73,7 @@ class Status(IntEnum):
 _EXPLANATIONS = {
     Status.SOLVED: "solved to the certificate's tolerance",
     Status.INFEASIBLE: "no z satisfies C z = b and the hard rows (w = inf); soften rows with a "
-    "finite w, or check b, lb, ub and levels",
+    "finite w, or check s, a, b, lb, ub and levels",
     Status.UNBOUNDED: "the cost decreases without bound; add curvature to H or bounds to G",
     Status.NOT_CONVERGED: "no solver reached the certificate's tolerance, and the QP is neither "
     "provably infeasible nor unbounded; it may be ill-conditioned, like the predictions of an "
