@@ -26,17 +26,17 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 297,
-    "analysis": 846,
+    ".": 294,
+    "analysis": 827,
     "control": 4842,  # nonlinear plants, drifts as disturbances
-    "envs": 1346,
-    "experiment": 2705,
-    "export": 1431,
-    "learning": 2791,  # models that did not train theta decide in improve
-    "identification": 2766,  # drifts keep steady gains right
-    "mpc": 3831,
-    "proofs": 1001,
-    "qp": 5295,
+    "envs": 1316,
+    "experiment": 2687,
+    "export": 1425,
+    "learning": 2747,  # models that did not train theta decide in improve
+    "identification": 2774,  # drifts keep steady gains right
+    "mpc": 3813,
+    "proofs": 998,
+    "qp": 5234,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

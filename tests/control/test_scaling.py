@@ -75,10 +75,10 @@ def test_bounds_far_away_of_an_input_without_a_cost_set_no_size(plant, Q):
 def test_bounds_set_no_unit_of_the_riccati_equation():
     bounds = {"y_bounds": (-1e5, 1e5), "u_bounds": {"u2": (-0.1, 0.1)}}
     model = [[1.1]], [[1.0, 0.5]], [[1.0]]
-    own, far = (
-        riccati(qm.LinearMPC(model, 3, Q=1.0, R=0.1, dR=[0.5, 1.0], **x).design)
-        for x in ({}, bounds)
-    )
+    weights: Any = {"Q": 1.0, "R": 0.1, "dR": [0.5, 1.0]}
+    own, far = (riccati(qm.LinearMPC(model, 3, **weights, **x).design) for x in ({}, bounds))
+    assert own is not None
+    assert far is not None
     assert np.allclose(far, own, rtol=1e-9)
 
 

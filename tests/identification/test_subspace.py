@@ -134,6 +134,7 @@ def test_a_level_that_drifts_is_no_mode_that_lasts(seed, rows, turn):
         x = A @ x + B * (u[-1] + load)
     fit = qm.identify({"y": np.array(y), "u": np.array(u)}).fit
     assert fit.drifts == 1
+    assert fit.plant is not None
     assert np.abs(fit.plant[0].poles).max() < 0.94
 
 
