@@ -326,6 +326,7 @@ def test_a_response_that_is_rare_is_no_error():
 @refused(
     (5, {}, "data: got int, expected a CSV file, a DataFrame, a dict of arrays, a list"),
     ([], {}, "data: got an empty list, expected a CSV file"),
+    (room().set_index(["T_out", "t"]), {}, "data: got an index of several levels, expected one"),
     ("none.csv", {}, r"data: got none.csv, which cannot be read \(.*No such file"),
     ("http://a.b/c.csv", {}, r"data: got http://a.b/c.csv, which cannot be read"),
     (room(), {"inputs": [None]}, "column: got 'None', which is missing"),

@@ -109,6 +109,9 @@ def _frame(part: Any) -> pd.DataFrame:
             got = f"{part}, which cannot be read ({error})"
             raise QPError.expected("data", got, "a CSV file that begins with a header") from error
     if isinstance(part, pd.DataFrame):
+        if isinstance(part.index, pd.MultiIndex):
+            remedy = "Call reset_index(), and name its columns by time= and episode=."
+            raise QPError.expected("data", "an index of several levels", "one of times", remedy)
         timed = isinstance(part.index, pd.DatetimeIndex | pd.TimedeltaIndex | pd.PeriodIndex)
         return part.assign(**{TIME_INDEX: part.index}) if timed else part.copy()
     if not isinstance(part, Mapping):
