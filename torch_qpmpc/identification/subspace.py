@@ -27,7 +27,6 @@ from torch_qpmpc.identification.likelihood import (
     Noisy,
     Signals,
     em,
-    lasting,
     starting,
     steady,
     with_drifts,
@@ -56,8 +55,7 @@ SETTLING = 20
 #: so are those that differ by less than ERRORS standard errors and the share MOST. Errors below
 #: EXACT, as a share of the variance, are none.
 MARGIN, ERRORS, MOST, EXACT = 0.004, 2.0, 0.1, 1e-8
-#: Drifts may raise squared errors far ahead, which inputs of chance lower, by the share WORSE; in
-#: place of a `lasting` mode, of which errors so near do not tell, by any.
+#: Drifts may raise squared errors far ahead, which inputs of chance lower, by the share WORSE.
 WORSE = 0.2
 #: Errors of a model that diverges, in standard deviations.
 WORST = 1e6
@@ -142,7 +140,7 @@ def fit_state_space(
 
         par = min((likely, par), key=far) if likely is not par else par
         drifting, count = with_drifts(par, data)
-        if count and (lasting(par.A) or far(drifting) <= far(par) + WORSE):
+        if count and far(drifting) <= far(par) + WORSE:
             par, drifts = drifting, count
         model = readable(steady(par), data)
     plant = None
