@@ -121,6 +121,23 @@ def test_a_load_that_drifts_is_told_from_the_level_that_it_moves(seed):
     assert pytest.approx(0.05, rel=0.02) == fit.plant[0].B
 
 
+@pytest.mark.parametrize(("seed", "rows", "turn"), [(3, 300, 0.0), (76, 300, 0.0), (7, 400, 0.15)])
+def test_a_level_that_drifts_is_no_mode_that_lasts(seed, rows, turn):
+    """Of a walk's few rows a mode beyond one often seems likelier, or better some steps ahead."""
+    rng, x, load, y, u = np.random.default_rng(seed), np.zeros(2), 0.0, [], []
+    A = np.array([[0.91, turn], [-turn, 0.91]]) if turn else np.diag([0.8, 0.0])
+    B = np.array([0.0, 1.3 * turn]) if turn else np.array([0.2, 0.0])
+    for k in range(rows):
+        u.append(u[-1] if k % 5 else rng.uniform(-1, 1))
+        y.append(x[0] + 0.02 * rng.normal())
+        load += 0.01 * rng.normal()
+        x = A @ x + B * (u[-1] + load)
+    fit = qm.identify({"y": np.array(y), "u": np.array(u)}).fit
+    assert fit.drifts == 1
+    assert fit.plant is not None
+    assert np.abs(fit.plant[0].poles).max() < 0.94
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 def test_a_slow_mode_that_inputs_move_is_none_of_the_drifts(noise):
     """Its gain is known to the accuracy of a log of three of its times."""

@@ -25,9 +25,10 @@ STALLED = 1e-4
 #: A mode, or a pair, this near to one may be a drift, which forgets at least the share FORGETS a
 #: step. A pair as near as TWINS may be one and an integrator.
 SLOW, FORGETS, TWINS = 0.2, 1e-3, 0.05
-#: The level of the test that inputs move a mode; extrapolations of its fits, and the gain per step
-#: that ends them.
-LEVEL, CYCLES, LEFT = 0.01, 100, 1e-6
+#: The level of the test that inputs move a mode, and the coefficients that the place of a `lasting`
+#: one counts for: its ratios are larger (Dickey and Fuller 1981); extrapolations of its fits, and
+#: the gain per step that ends them.
+LEVEL, ROOT, CYCLES, LEFT = 0.01, 2, 100, 1e-6
 #: The least variances of the noise of normalised states and outputs.
 FLOOR_Q, FLOOR_R = 1e-12, 1e-8
 
@@ -172,13 +173,13 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
     states, which noise alone moves.
     """
     drifts, n_y = 0, len(par.C)
-    least = scipy.stats.chi2.isf(LEVEL, par.B.shape[1] * np.arange(1, n_y + 1)) / 2
     most, full = likeliest(par, data)
     while drifts < n_y:
         own, found = len(par.A) - drifts, []
         for modes in _slow_modes(full.A[:own, :own], full.B[:own]):
             if (count := drifts + len(modes)) <= n_y:
-                lost = least[len(modes) - 1]
+                held = len(modes) * par.B.shape[1] + ROOT * lasting(full.A)
+                lost = scipy.stats.chi2.isf(LEVEL, held) / 2
                 value, one = likeliest(_with_drifts(full, modes), data, count, most - lost)
                 found.append((value + lost, value, count, one))
         shown, value, count, one = max(found, default=(-np.inf, 0.0, 0, par), key=lambda x: x[0])
@@ -187,6 +188,11 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
         most, drifts = value, count
         par = full = one
     return par, drifts
+
+
+def lasting(A: Array) -> bool:
+    """Return True if a mode grows, or forgets less than a drift."""
+    return bool(np.abs(np.linalg.eigvals(A)).max() > 1 - FORGETS)
 
 
 def _slow_modes(A: Array, B: Array) -> list[Array]:

@@ -27,6 +27,7 @@ from torch_qpmpc.identification.likelihood import (
     Noisy,
     Signals,
     em,
+    lasting,
     starting,
     steady,
     with_drifts,
@@ -55,7 +56,8 @@ SETTLING = 20
 #: so are those that differ by less than ERRORS standard errors and the share MOST. Errors below
 #: EXACT, as a share of the variance, are none.
 MARGIN, ERRORS, MOST, EXACT = 0.004, 2.0, 0.1, 1e-8
-#: Drifts may raise squared errors far ahead, which inputs of chance lower, by the share WORSE.
+#: Drifts may raise squared errors far ahead, which inputs of chance lower, by the share WORSE; in
+#: place of a `lasting` mode also by ERRORS standard errors: those of a horizon are as one.
 WORSE = 0.2
 #: Errors of a model that diverges, in standard deviations.
 WORST = 1e6
@@ -140,7 +142,8 @@ def fit_state_space(
 
         par = min((likely, par), key=far) if likely is not par else par
         drifting, count = with_drifts(par, data)
-        if count and far(drifting) <= far(par) + WORSE:
+        chance = ERRORS * lasting(par.A) * np.sqrt(HORIZONS[-1] / sum(len(v) for _, v in data))
+        if count and far(drifting) <= far(par) + WORSE + chance:
             par, drifts = drifting, count
         model = readable(steady(par), data)
     plant = None
