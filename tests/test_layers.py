@@ -30,13 +30,13 @@ BUDGET = {
     "analysis": 827,
     "control": 4842,  # nonlinear plants, drifts as disturbances
     "envs": 1316,
-    "experiment": 2687,
+    "experiment": 2695,
     "export": 1425,
     "learning": 2747,  # models that did not train theta decide in improve
-    "identification": 2778,  # drifts keep steady gains right
+    "identification": 2777,  # drifts keep steady gains right
     "mpc": 3813,
     "proofs": 998,
-    "qp": 5234,
+    "qp": 5235,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

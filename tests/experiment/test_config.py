@@ -108,6 +108,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("task", 3, "got 3, expected its keys, as in configs/task/."),
     ("task.name", "unknown", "got 'unknown', expected one of "),
     ("task.A", [[1.0], [1.0, 2.0]], "but rows should be equally long."),
+    ("task.id", "???", "got '???', expected the id of a Gymnasium environment, as in task.id="),
     ("batchsize", 3, "got an unknown key, expected a key of the chosen groups. Did you mean batch"),
     ("taks", 3, "got an unknown key, expected a key of the chosen groups. Did you mean task?"),
     ("constraint.deviaton.c_1", 3, "got an unknown key, .* Did you mean constraint.deviation.c_1?"),

@@ -330,6 +330,7 @@ CODES = r"of torch.int8, expected \(3, 13\) of torch.int8. Pass the solution of 
     ({"fixed": torch.ones(13)}, r"fixed: got shape \(13,\), .* with n_f <= n_z = 12"),
     ({"fixed": torch.ones(4, 2)}, r"fixed: got shape \(4, 2\), .* the QP's batch \(3,\)"),
     ({"on_failure": None}, "on_failure: got None, expected one of raise, warn, mask"),
+    ({"solver": ["daqp"]}, "solver: got list, expected a str"),
     ({"on_failure": "ignore"}, "on_failure: got 'ignore', expected one of raise, warn, mask"),
     ({"warm_start": solve_qp(OTHER.qp, OTHER.fixed)}, rf"warm_start: got shape \(13,\) {CODES}"),
     ({"warm_start": torch.zeros(3, 12).char()}, rf"warm_start: got shape \(3, 12\) {CODES}"),

@@ -175,11 +175,10 @@ def with_drifts(par: Noisy, data: Sequence[Signals]) -> tuple[Noisy, int]:
     drifts, n_y = 0, len(par.C)
     most, full = likeliest(par, data)
     while drifts < n_y:
-        own, found = len(par.A) - drifts, []
+        own, place, found = len(par.A) - drifts, ROOT * lasting(full.A), []
         for modes in _slow_modes(full.A[:own, :own], full.B[:own]):
             if (count := drifts + len(modes)) <= n_y:
-                held = len(modes) * par.B.shape[1] + ROOT * lasting(full.A)
-                lost = scipy.stats.chi2.isf(LEVEL, held) / 2
+                lost = scipy.stats.chi2.isf(LEVEL, len(modes) * par.B.shape[1] + place) / 2
                 value, one = likeliest(_with_drifts(full, modes), data, count, most - lost)
                 found.append((value + lost, value, count, one))
         shown, value, count, one = max(found, default=(-np.inf, 0.0, 0, par), key=lambda x: x[0])

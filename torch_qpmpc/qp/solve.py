@@ -71,6 +71,7 @@ def solve_qp(
         True
     """
     check_kind("qp", qp, QuadraticProgram, "Pass mpc.quadratic_program(), or call mpc.solve(s).")
+    check_kind("solver", solver, str)
     if fixed is None:
         fixed = qp.q.new_zeros(0)
     return solve(qp, fixed, None, solver, on_failure, warm_start)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import AfterValidator
 
 from torch_qpmpc.envs import GymnasiumPlant
 from torch_qpmpc.errors import QPError
@@ -19,6 +20,13 @@ from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.scheme import Scheme
 
 
+def _is_chosen(id: str) -> str:
+    if id == "???":
+        want = "the id of a Gymnasium environment, as in task.id=Pendulum-v1"
+        raise QPError.expected("task.id", repr(id), want)
+    return id
+
+
 class GymnasiumSettings(TaskSettings):
     """The keys of the environment and its linear model."""
 
@@ -27,7 +35,7 @@ class GymnasiumSettings(TaskSettings):
     eval_steps: Count | None  # pyright: ignore[reportIncompatibleVariableOverride]
     #: Take the bounds of the observation space as constraints.
     observation_bounds: bool
-    id: str
+    id: Annotated[str, AfterValidator(_is_chosen)]
     kwargs: dict[str, Any] | None = None
     #: The model; null by default, as with ``start=data``, which replaces it.
     A: Matrix | None
