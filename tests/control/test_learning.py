@@ -84,13 +84,15 @@ def test_the_same_object_costs_less_in_the_environment_with_the_same_design():
 @pytest.mark.parametrize("model", [WRONG, RIGHT])
 def test_a_log_says_that_loops_start_off_rest(model):
     """Without one the filter takes such a start for a disturbance, also with the right model."""
-    controller = made(model)
+    controller, none = made(model), np.zeros(0)
+    for y in (0.0, np.nan):
+        controller.step([y], [1.0])
     assert controller.learn(Lag(start=3.0), **QUICK).accepted
-    u = controller.u
-    controller.step([1.0], [1.0])  # starts again, from rest
-    settled = controller.observer.at_rest(u, np.zeros(0), np.array([1.0]))
-    after = controller.observer.predicted(settled, controller.u, np.zeros(0))
-    assert np.allclose(np.concatenate((controller.x, controller.w)), after)
+    observer, e = controller.observer, controller.observer.at_rest(controller.u, none, [1.0])
+    for y in (1.0, 0.8):  # starts again, from rest, with the steady gain: the gap is forgotten
+        controller.step([y], [1.0])
+        e = observer.predicted(e + observer.L @ (y - observer.H @ e), controller.u, none)
+        assert np.allclose(np.concatenate((controller.x, controller.w)), e)
     assert np.allclose(controller.mpc.design.plant.A, 0.9, atol=0.05)
 
 
@@ -166,7 +168,7 @@ def test_a_candidate_that_fails_is_not_accepted(monkeypatch):
     ({"transitions": 0}, "transitions: got 0, expected a whole number >= 1"),
     ({"pairs": 4}, "pairs: got 4, expected a whole number >= 16"),
     ({"seed": -1}, "seed: got -1, expected a whole number >= 0"),
-    ({"r": None}, "r: got None in the first step, expected set-points of y1"),
+    ({"r": None}, "r: got None before any valid set-point, expected set-points of y1"),
     ({"spread": 0.0}, r"spread: got \[0.0\], expected distances >= 0, not all of them 0"),
 )
 def test_bad_arguments_are_named(options):

@@ -174,7 +174,7 @@ def test_pairs_of_bounds_and_prices_are_of_any_numbers(read):
 @refused(
     ({"Q": None}, "Q: got no cost, expected weights .* Pass one, such as Q={'y1': 1.0}, dR="),
     ({"Q": {"T": 1.0}}, "Q: got 'T', expected names among y1"),
-    ({"Q": [1.0, 2.0]}, r"Q: got shape \(2,\) or NaN, expected a number, or one for each of"),
+    ({"Q": [1.0, 2.0]}, r"Q: got shape \(2,\), expected a number, or one for each of"),
     ({"linear": {"u1": "d1"}, "E": [[1.0]]}, "linear: got 'd1', which acts on the plant"),
     ({"Q": [[1.0, 2.0]]}, r"Q: got shape \(1, 2\), expected \(1, 1\)"),
     ({"dR": -1.0}, "dR: got smallest eigenvalue -1, expected a positive semidefinite weight"),

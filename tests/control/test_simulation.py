@@ -186,11 +186,11 @@ def test_the_figure_has_a_panel_for_each_signal_with_its_unit():
 
 @refused(
     ({"steps": 0}, "steps: got 0, expected a whole number >= 1"),
-    ({"r": None}, "r: got None in the first step, expected set-points of y1"),
+    ({"r": None}, "r: got None before any valid set-point, expected set-points of y1"),
     ({"noise": -1.0}, r"noise: got \[-1.0\], expected standard deviations >= 0"),
-    ({"load": [1.0, 2.0]}, r"load: got shape \(2,\) or NaN, expected a number, or one for"),
+    ({"load": [1.0, 2.0]}, r"load: got shape \(2,\), expected a number, or one for"),
     ({"u": [1.0, 2.0]}, r"u: got shape \(1, 2\), expected 1 numbers"),
-    ({"x": [1.0, 2.0]}, r"x: got shape \(2,\) or NaN, expected a number, or one for"),
+    ({"x": [1.0, 2.0]}, r"x: got shape \(2,\), expected a number, or one for"),
     ({"plant": ([[0.5]], [[1.0, 1.0]])}, "plant: got 2 inputs, 1 outputs, 0 known signals, expect"),
     (
         {"plant": qm.LinearMPC(LAG, 3, Q=1.0, E=[[1.0]]).design.plant},

@@ -99,7 +99,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("seed", 2**63, "got 9223372036854775808, but input should be less than 9223372036854775808."),
     ("exploration_std", math.inf, "got inf, but input should be a finite number."),
     ("task.state_slack", -1.0, "got -1.0, but input should be greater than or equal to 0."),
-    ("gate", "acts", "got 'acts', but input should be 'act' or 'plant'."),
+    ("gate", "acts", "got 'acts', but input should be 'act', 'plant', True or False."),
     ("solver", "cplex", "got 'cplex', expected one of proxqp, daqp"),
     ("constraint.learn", ["C", "H"], "got 'H', but input should be 'C', 'b', 'G', 'lb' or 'ub'."),
     ("constraint.si", 3, "got 3, but input should be a valid dictionary"),

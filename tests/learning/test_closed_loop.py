@@ -14,6 +14,7 @@ from tests.problems import central_difference
 from tests.refused import refused
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.identification.identification import Identified, identify
+from torch_qpmpc.identification.log import Trajectory
 from torch_qpmpc.learning.closed_loop import (
     SimulatedPlant,
     _Loops,
@@ -253,6 +254,14 @@ def test_pieces_of_a_single_trajectory_make_an_ensemble(seed):
     assert (np.abs(poles - np.hypot(0.9, 0.3)) < 0.1).all()
     assert 1e-4 < poles[:, 0].std() < 0.05
     assert len(ensemble(logged(1, 15), 8, seed)) == 8  # of whatever pieces
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_ensemble_leaves_out_trajectories_too_short_for_a_fit(found, seed):
+    one = found.log.trajectories[0]
+    short = Trajectory(one.y[:3], one.u[:2], one.d[:2])
+    log = dataclasses.replace(found.log, trajectories=[*found.log.trajectories[:2], *[short] * 14])
+    assert len(ensemble(dataclasses.replace(found, log=log), 12, seed)) == 12
 
 
 def test_what_is_no_better_or_stopped_leaves_theta_as_it_was():

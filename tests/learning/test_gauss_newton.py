@@ -232,6 +232,7 @@ def test_a_warm_start_saves_time_only():
     ({"damping": -1.0}, {}, "damping: got -1.0, expected a finite number > 0"),
     ({"scales": {"A": 1.0}}, {}, r"rates: got \['A'\], expected names among"),
     ({}, {"clip": math.inf}, "clip: got inf, expected a finite number > 0"),
+    ({}, {"weights": torch.full((7,), math.nan)}, "weights: got NaN, inf or below 0, exp"),
 )
 def test_numbers_out_of_range_are_named(options, of_step):
     GaussNewton(mpc := random_mpc(2), **options).step(*pairs(), targets(mpc), **of_step)

@@ -54,8 +54,8 @@ class Controller:
 
     Attributes:
         status: the `Outcome` of the last step, SOLVED before the first.
-        p, target: the last plan's input ``(n_p,)`` and `Target`, None before the first: that of
-            its last stage, or of all if `Design.staged`.
+        p, target: the last plan's input ``(n_p,)``, zero before the first, and `Target`, None
+            before it: that of its last stage, or of all if `Design.staged`.
 
     Raises:
         QPError: an argument is invalid, or the model has no filter.
@@ -115,7 +115,7 @@ class Controller:
         self.status = Outcome.SOLVED
         self._now: Signals | None = None
         self.target: Target | None = None
-        self.p = torch.zeros(self.mpc.plan.n_p)
+        self.p = torch.zeros(self.mpc.plan.n_p, dtype=torch.float64)
 
     def __repr__(self) -> str:
         """Return its design and the last input."""
@@ -153,7 +153,7 @@ class Controller:
 
     @property
     def r(self) -> Array:
-        """The set-points of the last step."""
+        """The last valid set-points."""
         return self._memory.r.copy()
 
     def step(self, y: Any, r: Any = None, known: Any = None) -> Any:
@@ -317,7 +317,7 @@ class Controller:
         if report.accepted:
             self._own = self._law = ready(candidate)
             steps = len(self._law.observer.gains) - 1  # from rest
-            self._start(self._memory._replace(e=None, steps=steps))
+            self._start(self._memory._replace(e=None, P=None, steps=steps))
         return report
 
     def improve(self, log: Any, r: Any = None, spread: Any = None, **options: Any) -> Improvement:

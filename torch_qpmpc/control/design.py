@@ -343,7 +343,7 @@ class Design:
         return nominal
 
     def answers(self, shows: float) -> Array:
-        """Return the first steps, 0 of none, in which inputs move outputs their final way."""
+        """Return each output's first step in which inputs move it their final way, 0 for none."""
         # By a part ``shows`` of the largest move of the next ten steps.
         plant, x, steps = self.normal.plant, self.normal.plant.B, []
         growth = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())

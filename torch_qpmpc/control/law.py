@@ -47,7 +47,7 @@ class Memory(NamedTuple):
     Attributes:
         u, e: the last input ``(m,)``, and the next step's prediction of x and w, None at first.
         steps: the place of the next gain among `Observer.gains`, the last one from rest.
-        r: the set-points of the last step, ``(rows, n_y)``, without rows before the first.
+        r: the last valid set-points, ``(rows, n_y)``, without rows before the first.
         known: the known signals of the last step or reset, ``(n_d,)``, None before.
         runs: for how many steps each input was on (above its lowest level), or with a minus off;
             None without levels.
@@ -185,7 +185,7 @@ class Law:
     def begun(self, u: Array | None = None, rests: bool = False) -> Memory:
         """Return a memory without a past, with the last input u, by default zero, in its bounds.
 
-        The plant ``rests``, or is in a state of the log; without one it rests.
+        Unless it ``rests``, the plant is in any state of the log, if there is one.
         """
         last = np.clip(0.0 if u is None else u, *self.design.u_bounds)
         steps = len(self.observer.gains) - 1 if rests else 0
@@ -462,7 +462,7 @@ class Law:
         outputs = self.design.plant.outputs
         if r is None and not len(last) and self.design.Q.any():
             want = f"set-points of {', '.join(outputs)}"
-            raise QPError.expected("r", "None in the first step", want)
+            raise QPError.expected("r", "None before any valid set-point", want)
         r = (last if len(last) else np.zeros(len(outputs))) if r is None else by_name(r)
         unweighted = {*range(len(outputs))} - {*self.design.weighted}
         if isinstance(r, Mapping):

@@ -107,7 +107,7 @@ def review(law: Law, memory: Memory, r: Any = None, known: Any = None) -> Review
     findings.append(_stability(loop, design.gamma, terminal.remedy))
     if findings[-1].ok:
         findings += [_margin(loop, law), _offset(loop, design)]
-        if design.plant.noise is not None and findings[-3].ok:
+        if design.plant.noise is not None:
             findings.append(_noise(loop, law, design.plant.noise))
     return Review(findings)
 

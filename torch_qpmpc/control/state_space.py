@@ -260,7 +260,7 @@ def read_table(
         table = np.atleast_1d(_numbers(name, value))
         table = table[None] if table.ndim == 1 else table
     if table.ndim != 2 or table.shape[1] != len(names) or not len(table):
-        want = f"{len(names)} numbers ({', '.join(names)}), or rows of these"
+        want = f"{len(names)} numbers ({', '.join(names)}), or rows of these" if names else "None"
         raise QPError.expected(name, f"shape {table.shape}", want)
     if finite and not np.isfinite(table).all():
         raise QPError.expected(name, "NaN or inf", "finite numbers")
@@ -281,8 +281,8 @@ def read_vector(name: str, value: Any, names: Sequence[str], missing: float) -> 
     vector = _numbers(name, value)
     vector = np.full(len(names), float(vector)) if vector.ndim == 0 else vector.copy()
     if vector.shape != (len(names),) or np.isnan(vector).any():
-        want = f"a number, or one for each of {', '.join(names)}"
-        raise QPError.expected(name, f"shape {vector.shape} or NaN", want)
+        got = "NaN" if vector.shape == (len(names),) else f"shape {vector.shape}"
+        raise QPError.expected(name, got, f"a number, or one for each of {', '.join(names)}")
     return vector
 
 

@@ -116,7 +116,7 @@ def _compared(cfg: Config, physics: AnyPlant, named: dict[str, Start], bar: Any)
     for name in (*named, ZERO_ACTION):
         run(name)
     best, better = min(named, key=J), False
-    while not better and J(best) < J(ZERO_ACTION):
+    while J(best) < J(ZERO_ACTION):
         zero = costs[ZERO_ACTION]
         gain = torch.where(zero.isfinite(), costs[best] - zero, -torch.inf)
         test = PairedTest(2 * ALPHA)

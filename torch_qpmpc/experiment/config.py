@@ -189,7 +189,7 @@ class Config(Group):
         Literal["cholesky", "projection", "sdp"], AfterValidator(lambda x: check_step(x) or x)
     ]
     ablation: str | None
-    gate: Literal["act", "plant"] | bool
+    gate: Literal["act", "plant", True, False]
     gate_bound: Positive | None
     gate_interval: Count | None
     figures: bool

@@ -128,7 +128,7 @@ def fit_state_space(
     if lags is None:
         found = _compare(data, filled, trajectories, ORDERS if order is None else (order,))
         rows = [row for row, _ in found]
-        best = min(equal_candidates(rows), key=lambda row: (row.order, row.score))
+        best = equal_candidates(rows)[0]
         order, lags = best.order, best.lags
         parts = [readable(x, data) if order else x for x in found[rows.index(best)][1]]
     model, drifts = measured(data, filled), 0
@@ -361,7 +361,7 @@ def _compare(
         best = {row.order: row for row in reversed(rows)}.values()
         few = list(dict.fromkeys([*sorted(best, key=lambda row: row.score), *rows]))
         few = few[: max(REFINED, ROWS // sum(one.steps for one in trajectories))]
-        few.append(min(equal_candidates(rows), key=lambda row: (row.order, row.score)))
+        few.append(equal_candidates(rows)[0])
         found = found if len(orders) > 1 else {}
         for key in dict.fromkeys(row[:2] for row in few):
             pairs = zip(pars[key], folds, strict=True)
@@ -389,10 +389,10 @@ def _score(total: Array, count: Array) -> float:
 
 
 def equal_candidates(rows: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates whose scores are the least one within its error."""
+    """Return the candidates whose scores are the least one within its error, by order."""
     least = min((row.score for row in rows), default=0.0)
-    errors = {row: max(MARGIN, min(ERRORS * row.error, MOST)) for row in rows}
-    return [row for row in rows if row.score <= least + errors[row]]
+    equal = [x for x in rows if x.score <= least + max(MARGIN, min(ERRORS * x.error, MOST))]
+    return sorted(equal, key=lambda row: (row.order, row.score))
 
 
 # Normalised signals

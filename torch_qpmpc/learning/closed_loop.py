@@ -225,9 +225,10 @@ def crossed(
 def ensemble(identified: Identified, members: int, seed: int) -> list[Innovations]:
     """Return a model and those of trajectories of its log drawn with replacement.
 
-    A single trajectory is cut into pieces, which are drawn.
+    A single trajectory is cut into pieces, which are drawn; those too short to fit are not.
     """
-    log, fit = identified.log.trajectories, identified.fit
+    fit = identified.fit
+    log = [x for x in identified.log.trajectories if x.steps > fit.lags]
     if len(log) == 1:
         pieces = min(members, log[0].steps // (PIECE * (1 + fit.lags)))
         log = [part for (part,) in folds(log, max(pieces, 1))]
@@ -539,12 +540,12 @@ def improve(
             mpc.load_state_dict(before)
     ends = old.mean().item(), new.mean().item(), test.interval, held_out, longer, curve
     notes = ("In one loop it costs far more: a veto.",) * test.vetoed
-    notes += (f"With one more model, as the plant is, it may cost {worst:.0%} more.",) * (worst > 0)
+    notes += (f"With one more model, as the plant is, it may cost {worst:.1%} more.",) * (worst > 0)
     return Improvement(kept, *ends, int((news < olds).sum()), members, notes)
 
 
 def one_more(changes: Tensor, alpha: float) -> float:
-    """Return what one more model's change exceeds with probability alpha, NaN if one is finite."""
+    """Return what one more model's change exceeds with probability alpha, NaN of fewer than two."""
     d = changes[changes.isfinite()]
     variance = (d - d.mean()).square().sum() / (len(d) - 1)
     t = float(scipy.special.stdtrit(len(d) - 1, 1 - alpha))

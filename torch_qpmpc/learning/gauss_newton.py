@@ -154,6 +154,8 @@ class GaussNewton(torch.optim.Optimizer):
         self._check_batch(s, a, target, penalty)
         weights = torch.ones_like(target) if weights is None else weights
         check_tensor("weights", weights, len(s), batched=False)
+        if not (weights.isfinite() & (weights >= 0)).all():
+            raise QPError.expected("weights", "NaN, inf or below 0", "finite weights >= 0")
         if clip is not None:
             check_number("clip", clip, *POSITIVE)
         damping = self.param_groups[0]["damping"]

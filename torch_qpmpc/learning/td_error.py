@@ -53,7 +53,7 @@ def td_loss(prediction: Tensor, target: Tensor, clip: float | None = None) -> Te
 def td_metadata(prediction: Tensor, target: Tensor, use: Tensor) -> dict[str, Tensor]:
     """Return detached scalars that describe a batch of values and their targets, ``(*batch,)``.
 
-    Without ``use``, NaN targets count as invalid rewards, and other pairs as unsolved.
+    Of pairs not to ``use``, those with NaN targets count as invalid rewards, others as unsolved.
     """
     invalid = target.isnan()
     prediction, target = torch.where(use, prediction, 0), torch.where(use, target, 0)

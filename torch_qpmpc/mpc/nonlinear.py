@@ -30,7 +30,7 @@ from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.layout import Layout, banded_matrix
 from torch_qpmpc.qp.batching import times
-from torch_qpmpc.qp.pipeline.arrays import to_tensor
+from torch_qpmpc.qp.pipeline.arrays import BatchSolution, to_tensor
 from torch_qpmpc.qp.pipeline.batch import Programs
 from torch_qpmpc.qp.pipeline.solve import report
 from torch_qpmpc.qp.program import NDIMS, QuadraticProgram, Status, broadcast
@@ -54,8 +54,6 @@ PRICE, FIRM, SLIP = 2.0, 0.3, 1e-3
 #: The least eigenvalue of a definite Hessian, multiplier of an active row, and change of a state by
 #: actions, relatively.
 DEFINITE, ACTIVE, LEVER = 1e-9, 1e-8, 1e-3
-#: The parts of a `QPSolution` besides its QP.
-PARTS = [*QPSolution.__annotations__][1:]
 
 
 class RungeKutta(nn.Module):
@@ -302,19 +300,19 @@ class SequentialQP(nn.Module):
         with torch.no_grad():
             plan = plan.to(fixed).reshape(len(fixed), N, n_u)
             u, known, converged = self._search(flat, fixed, plan, n_kept, solver)
-            w, x = known[1][:, self.entries], self.layout.predicted(known[1])[0][:, 1:]
-            defect = torch.zeros_like(known[0])  # of what `simulated` returns
+            w, x = known.z[:, self.entries], self.layout.predicted(known.z)[0][:, 1:]
+            defect = torch.zeros_like(known.value)  # of what `simulated` returns
             if converged.any():
                 off = self.outputs(w[converged])[..., :-1] - x[converged]
                 defect[converged] = off.abs().amax((1, 2))
-        if on_failure != "mask" and known[5].any():
-            report(known[5].cpu().numpy(), batch, on_failure)
+        if on_failure != "mask" and known.status.any():
+            report(known.status.cpu().numpy(), batch, on_failure)
         strict = None
         if torch.is_grad_enabled() and any(x.requires_grad for x in (*theta, *self.parameters())):
-            own = self.along(flat, known[1], known[2], None)
-            solved = known[5] == Status.SOLVED
+            own = self.along(flat, known.z, known.chi, None)
+            solved = known.status == Status.SOLVED
             strict = torch.zeros_like(solved)
-            z, lam = known[1][solved], known[3][solved]
+            z, lam = known.z[solved], known.lam[solved]
             strict[solved] = _strict(_taken(own, solved), fixed[solved], z, lam)
             value, *rest = Known.apply(*own.tensors(), fixed, None, n_kept, solver, known)
             known = (value, *(x.where(strict[:, None], x.detach()) for x in rest[:4]), *rest[4:])
@@ -324,8 +322,8 @@ class SequentialQP(nn.Module):
 
     def _search(
         self, qp: QuadraticProgram, fixed: Tensor, plan: Tensor, n_kept: int, solver: str
-    ) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
-        """Return the best plans found, the `PARTS` of their QPs' solutions, and the converged."""
+    ) -> tuple[Tensor, BatchSolution, Tensor]:
+        """Return the best plans found, their QPs' solutions, and the converged."""
         layout, B, every = self.layout, len(fixed), torch.arange(len(fixed))
         n_p, n, N, p = layout.n_p, layout.n, layout.horizon, fixed[:, : layout.n_p]
         of_x = F.pad(torch.arange(N * n) % n >= layout.n_u, (n_p, 0), value=True)
@@ -382,7 +380,7 @@ class SequentialQP(nn.Module):
                 near = replace(near, w=torch.where(stuck, price[todo], near.w), check_values=False)
                 solution = solve(near, fixed[todo], n_kept, solver, "mask", None)
             solved, among = solution.solved, torch.arange(len(todo))
-            own = [getattr(solution, name) for name in PARTS]
+            own = [getattr(solution, name) for name in BatchSolution._fields]
             for part, x in zip(parts, own, strict=False):  # none at first
                 part[todo[solved]] = x[solved]
             parts = parts or own
@@ -408,14 +406,15 @@ class SequentialQP(nn.Module):
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
             done[todo] = converged[todo] | (pull[todo] > MOST)
-        left = (~converged & (parts[5] == 0)).nonzero().squeeze(1)  # the plan in place of the QP's
-        parts[0][left] = merit(price, costs, over)[left]
-        parts[1][left] = z[left]
-        parts[5][left[parts[0][left].isinf()]] = int(Status.INVALID_DATA)
-        y = times(qp.G, parts[1])
+        found = BatchSolution(*parts)
+        left = (~converged & (found.status == 0)).nonzero().squeeze(1)
+        found.value[left] = merit(price, costs, over)[left]  # the plan in place of the QP's
+        found.z[left] = z[left]
+        found.status[left[found.value[left].isinf()]] = int(Status.INVALID_DATA)
+        y = times(qp.G, found.z)
         over = (hard & (torch.maximum(qp.lb - y, y - qp.ub) > SLIP * bound)).any(1)
-        parts[5] = torch.where(over & (parts[5] == 0), failed, parts[5])
-        return u, tuple(parts), converged
+        status = torch.where(over & (found.status == 0), failed, found.status)
+        return u, found._replace(status=status), converged
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:
         """Return plans ``(.., K, N, n_u)``, held at zero and random within the bounds."""
@@ -491,7 +490,7 @@ def _silu(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return x * y, y + x * slope, slope * (2 + x * (1 - 2 * y))
 
 
-def _taken(qp: QuadraticProgram, index: Any = slice(None), more: int = 0) -> QuadraticProgram:
+def _taken(qp: QuadraticProgram, index: Any, more: int = 0) -> QuadraticProgram:
     """Return the QPs at ``index``, detached, with ``more`` dimensions after the batch's."""
     parts = [
         x.detach() if x.ndim == n else x.detach()[index].unflatten(0, (-1, *(1,) * more))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -103,8 +103,7 @@ def fit_stage_cost(v: Tensor, cost: Tensor, n_free: int = 0, diagonal: bool = Fa
     W, q, c = _fit(seen)
     W, q, c = unit * W * scale * scale.unsqueeze(-1), unit * q * scale, unit * c
     fitted = StageCost(W, q - W @ middle, c - q @ middle + middle @ W @ middle / 2)
-    R2 = _adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows))
-    return StageCost(fitted.W, fitted.q, fitted.c, R2)
+    return replace(fitted, R2=_adjusted_R2(cost, cost - fitted(v), 1 + n + len(rows)))
 
 
 def _adjusted_R2(cost: Tensor, error: Tensor, coefficients: int) -> float:
@@ -136,8 +135,7 @@ def _fit(seen: _Observed) -> tuple[Tensor, Tensor, Tensor]:
     W, q, c = _completed(seen, nearest, weights)
     if _error(seen, W, q, c, weights) <= (1 + HARMLESS) * before + HARMLESS * EXACT:
         return W, q, c
-    weights = torch.ones_like(weights)
-    return _completed(seen, _best_convex(seen, block), weights)
+    return _completed(seen, _best_convex(seen, block), torch.ones_like(weights))
 
 
 def _error(seen: _Observed, W: Tensor, q: Tensor, c: Tensor, weights: Tensor) -> Tensor:
