@@ -101,13 +101,13 @@ def _cost(design: Design, layout: Layout) -> Cost:
     one = places["one"].start
     stage[one, one] = 2 * SCALE * design.typical
     size = places["u"].start
-    P, off = riccati(design), off[:, :size]
+    P, end = riccati(design), off[:, :size]
     x = np.vstack((s["x"], s["u_last"]))[:, :size]
     if P is None:
         terminal = _squares(y[:, :size], design.Q)
     else:
         L, W = _slope(design, P)
-        terminal = _squares(x, P / 2) + _squares(off, W / 2) + x.T @ L @ off + off.T @ L.T @ x
+        terminal = _squares(x, P / 2) + _squares(end, W / 2) + x.T @ L @ end + end.T @ L.T @ x
     q = layout.from_stage(torch.as_tensor(linear).expand(layout.horizon, 1, -1)).sum(0)
     return Cost(stage, terminal, hessian="block", q=q)
 
@@ -147,8 +147,8 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     values, V = np.linalg.eigh(P)
     values, V = values[costly := values > TINY * values[-1]], V[:, costly]
     own = V.T @ L / np.sqrt(values)[:, None]
-    of_r = of_y[of_r]  # and a slope without a cost would have no least value
-    return V @ V.T @ L / np.outer(sizes, of_r), own.T @ own / np.outer(of_r, of_r)
+    size_r = of_y[of_r]  # and a slope without a cost would have no least value
+    return V @ V.T @ L / np.outer(sizes, size_r), own.T @ own / np.outer(size_r, size_r)
 
 
 def riccati(design: Design) -> Array | None:

@@ -235,8 +235,8 @@ class GaussNewton(torch.optim.Optimizer):
         for block, step in zip(blocks, steps, strict=True):
             block.leaf.add_(step, alpha=lr)
         proposed = lr * change
-        change = self._project(blocks, proposed)
-        predicted = before - objective(delta - change, blocks)
+        projected = self._project(blocks, proposed)
+        predicted = before - objective(delta - projected, blocks)
         if self.param_groups[0].get("unsolved"):
             after = self._mpc.solve(s[:FIRST], a[:FIRST], solution.active[:FIRST])
             if not (after.solved | (root[:FIRST] == 0)).all():
@@ -247,7 +247,7 @@ class GaussNewton(torch.optim.Optimizer):
         actual = root * torch.where(root > 0, after.value - solution.value, 0)
         decrease = before - objective(delta - actual, blocks)
         # Without a predicted decrease, reject the step only if the projection raised the objective.
-        lost = not torch.equal(change, proposed) and not decrease >= 0
+        lost = not torch.equal(projected, proposed) and not decrease >= 0
         return float(decrease / predicted) if predicted > 0 else float(not lost)
 
     def __reduce__(self) -> tuple:

@@ -81,8 +81,8 @@ class SoftQPs(NamedTuple):
             size = np.abs(self.g).max(-1, initial=0.0) / curvature[self.group]
             if not ((size > LONG) & (size < np.inf)).any():
                 return solve(self)
-            near = (np.where(x != 0, np.abs(x), np.inf) for x in (self.l, self.u))
-            near = np.minimum(*near) / np.linalg.norm(self.G, axis=-1)[self.group]
+            ends = (np.where(x != 0, np.abs(x), np.inf) for x in (self.l, self.u))
+            near = np.minimum(*ends) / np.linalg.norm(self.G, axis=-1)[self.group]
             size = np.minimum(size, np.median(near, axis=-1)) if near.shape[1] else size
         long = (size > LONG) & (size < np.inf)
         length = np.where(long, np.ldexp(1.0, np.frexp(size)[1]), 1.0)[:, None]

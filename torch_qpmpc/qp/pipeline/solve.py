@@ -282,8 +282,8 @@ def steps_of(
     Up to `FEW` QPs that the solver leaves are refined one by one at once; more of them after other
     eliminations, which solve whole batches, but cost more than a diagnosis.
     """
-    others = (name for name in FALLBACKS if name != solver or name == FALLBACKS[-1])
-    solves = BACKENDS.get(solver) or backend(solver), *map(BACKENDS.__getitem__, others)
+    fallbacks = (name for name in FALLBACKS if name != solver or name == FALLBACKS[-1])
+    solves = BACKENDS.get(solver) or backend(solver), *map(BACKENDS.__getitem__, fallbacks)
     first, *others, last = map(backed, solves)
     refined = partial(_refined, log)
     return [
