@@ -139,22 +139,14 @@ def test_a_policy_that_fails_is_worse(value, decision):
     assert test.decision == decision
 
 
-def test_a_better_candidate_is_kept():
-    gate, candidate = Gate(Policy(2.0), costs), Policy(1.0)
-    test = gate.judge(candidate)
-    assert test.decision == "better"
-    assert test.interval[1] < 0
-    assert gate.actor.level == 1.0
-    assert (gate.accepted, gate.rejected) == (1, 0)
-
-
-@pytest.mark.parametrize("level", [2.0, 2.5])
-def test_any_other_candidate_is_not(level):
+@pytest.mark.parametrize(("level", "better"), [(1.0, True), (2.0, False), (2.5, False)])
+def test_a_candidate_is_kept_if_it_is_better(level, better):
     gate = Gate(Policy(2.0), costs)
     test = gate.judge(Policy(level))
-    assert test.decision != "better"
-    assert gate.actor.level == 2.0
-    assert test.pairs == 32
+    assert (test.decision == "better") == (test.interval[1] < 0) == better
+    assert gate.actor.level == (level if better else 2.0)
+    assert (gate.accepted, gate.rejected) == (better, not better)
+    assert test.pairs == (96 if better else 32)
 
 
 def test_an_undecided_comparison_ends_in_a_rejection():
