@@ -8,7 +8,8 @@ import torch
 from scipy.optimize import linprog
 
 from tests.integrator import BOX, A, B, integrator
-from torch_qpmpc import QPMPC, QPError
+from tests.refused import refused
+from torch_qpmpc import QPMPC
 from torch_qpmpc.proofs import Plant, Polytope, invariant, invariant_set
 
 NOISE = Polytope.box([-0.01, -0.01], [0.01, 0.01])
@@ -108,22 +109,16 @@ def test_the_set_lies_about_the_equilibrium(one_gain):
     assert (answer.set.lower + answer.set.upper) / 2 == pytest.approx(shift, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("ask", "sentence"),
-    [
-        (lambda: invariant_set(scheme(), Plant.of(2 * A, B), BOX), "without its inequalities"),
-        (
-            lambda: invariant_set(
-                scheme(), Plant.of(A, B, disturbances=Polytope.box([-0.5] * 2, [0.5] * 2)), BOX
-            ),
-            "a set without a part that is proved invariant",
+@refused(
+    (lambda: invariant_set(scheme(), Plant.of(2 * A, B), BOX), ".*without its inequalities"),
+    (
+        lambda: invariant_set(
+            scheme(), Plant.of(A, B, disturbances=Polytope.box([-0.5] * 2, [0.5] * 2)), BOX
         ),
-        (lambda: invariant_set(scheme(), PLANT, Polytope.box([0.0], [1.0])), "n_p = 2"),
-        (lambda: invariant_set(scheme(), Plant.of([[1.0]], [[1.0]]), BOX), "plant.B"),
-    ],
-    ids=["unstable", "disturbed", "states", "plant"],
+        ".*a set without a part that is proved invariant",
+    ),
+    (lambda: invariant_set(scheme(), PLANT, Polytope.box([0.0], [1.0])), ".*n_p = 2"),
+    (lambda: invariant_set(scheme(), Plant.of([[1.0]], [[1.0]]), BOX), r".*plant\.B"),
 )
-def test_errors(ask, sentence, one_gain):
-    with pytest.raises(QPError) as raised:
-        ask()
-    assert sentence in str(raised.value)
+def test_errors(ask, one_gain):
+    ask()

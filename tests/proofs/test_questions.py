@@ -8,7 +8,8 @@ import torch
 
 from tests.integrator import BOX, A, B
 from tests.integrator import integrator as scheme
-from torch_qpmpc import QPMPC, QPError, SolverError
+from tests.refused import refused
+from torch_qpmpc import QPMPC, SolverError
 from torch_qpmpc.proofs import (
     Plant,
     Polytope,
@@ -150,33 +151,28 @@ def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
         largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS)
 
 
-@pytest.mark.parametrize(
-    ("ask", "sentence"),
-    [
-        (lambda: Plant.of(A, B, offset=[0.0]), "(n, n), (n, n_u), (n,) and (n, 0)"),
-        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX), "no finite bound"),
-        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, [0.0]), "(2,) numbers"),
-        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, [0.0, np.inf]), "below inf"),
-        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, None, [-np.inf, 0.0]), "above -"),
-        (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, "high"), "lower: got 'high'"),
-        (lambda: Plant.of([[np.nan, 0.0], [0.0, 1.0]], B), "A: got NaN or inf"),
-        (lambda: Plant.of(A, B, disturbances=cast(Any, [0.1, 0.1])), "disturbances: got list"),
-        (
-            lambda: largest_violation(scheme(), Plant.of([[1.0]], [[1.0]]), BOX, BOX.lower),
-            "plant.B",
-        ),
-        (
-            lambda: largest_violation(scheme(), Plant.of(A, B), BOX, BOX.lower, steps=0),
-            "a whole number >= 1",
-        ),
-        (lambda: invariance(scheme(), Plant.of(A, B), Polytope.box([0.0], [1.0])), "n_p = 2"),
-        (lambda: largest_difference(scheme(), two_actions(), BOX), "2 actions"),
-        (lambda: largest_difference(scheme(), scheme(), BOX, seconds=np.nan), "seconds: got nan"),
-        (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=-1.0), "seconds: got -1.0"),
-        (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=cast(Any, None)), "got None"),
-    ],
+@refused(
+    (lambda: Plant.of(A, B, offset=[0.0]), r".*\(n, n\), \(n, n_u\), \(n,\) and \(n, 0\)"),
+    (lambda: largest_violation(scheme(), Plant.of(A, B), BOX), ".*no finite bound"),
+    (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, [0.0]), r".*\(2,\) numbers"),
+    (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, [0.0, np.inf]), ".*below inf"),
+    (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, None, [-np.inf, 0.0]), ".*above -"),
+    (lambda: largest_violation(scheme(), Plant.of(A, B), BOX, "high"), ".*lower: got 'high'"),
+    (lambda: Plant.of([[np.nan, 0.0], [0.0, 1.0]], B), ".*A: got NaN or inf"),
+    (lambda: Plant.of(A, B, disturbances=cast(Any, [0.1, 0.1])), ".*disturbances: got list"),
+    (
+        lambda: largest_violation(scheme(), Plant.of([[1.0]], [[1.0]]), BOX, BOX.lower),
+        r".*plant\.B",
+    ),
+    (
+        lambda: largest_violation(scheme(), Plant.of(A, B), BOX, BOX.lower, steps=0),
+        ".*a whole number >= 1",
+    ),
+    (lambda: invariance(scheme(), Plant.of(A, B), Polytope.box([0.0], [1.0])), ".*n_p = 2"),
+    (lambda: largest_difference(scheme(), two_actions(), BOX), ".*2 actions"),
+    (lambda: largest_difference(scheme(), scheme(), BOX, seconds=np.nan), ".*seconds: got nan"),
+    (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=-1.0), r".*seconds: got -1\.0"),
+    (lambda: invariance(scheme(), Plant.of(A, B), BOX, seconds=cast(Any, None)), ".*got None"),
 )
-def test_errors(ask, sentence):
-    with pytest.raises(QPError) as raised:
-        ask()
-    assert sentence in str(raised.value)
+def test_errors(ask):
+    ask()
