@@ -104,16 +104,6 @@ def test_the_default_dtype_changes_no_number(default):
     assert_close(found, expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_cast_of_the_module_is_a_cast_of_theta_alone(dtype):
-    mpc = random_mpc(0).to(dtype)
-    assert {part.dtype for part in mpc.parameters()} == {dtype}
-    for of_input in (torch.float32, torch.float64):
-        s = S.to(of_input)
-        assert mpc.value(s).dtype == mpc.policy(s).dtype == of_input
-        assert_close(mpc.value(s).double(), random_mpc(0).value(S), rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.parametrize("solver", BACKENDS)
 def test_solutions_of_inference_mode_are_differentiable_afterwards(solver):
     mpc, twin = random_mpc(0, solver=solver), random_mpc(0, solver=solver)
