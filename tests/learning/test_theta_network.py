@@ -18,6 +18,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss
 
 from tests.problems import central_difference, random_mpc
 from tests.refused import refused
+from tests.transitions import GAMMA, make_loss
 from torch_qpmpc import (
     QPMPC,
     GaussNewton,
@@ -131,13 +132,12 @@ def test_finite_differences_through_theta_keys(output):
 @pytest.mark.parametrize("known", [{}, {"n_d": 1}], ids=["state", "preview"])
 def test_the_loss_is_that_of_the_residuals_by_hand(known):
     mpc, theta, operator = scheduled(known)
-    loss = QPQLearningLoss(critic_of(theta, operator))
-    loss.make_value_estimator(gamma=0.9)
+    loss = make_loss(operator=critic_of(theta, operator))
     assert ("theta", "q") not in loss.in_keys
     td = transitions(mpc)
     before = set(td.keys(True, True))
     value = TensorDictSequential(theta, operator.get_value_operator())(td["next"].clone())
-    target = td["next", "reward"] + 0.9 * value["state_value"]
+    target = td["next", "reward"] + GAMMA * value["state_value"]
     prediction = critic_of(theta, operator)(td.clone())["state_action_value"]
     assert_close(loss(td)["loss_value"], 0.5 * (target - prediction).square().mean())
     assert set(td.keys(True, True)) - before == {"td_error"}  # theta is not stored
@@ -146,8 +146,7 @@ def test_the_loss_is_that_of_the_residuals_by_hand(known):
 @pytest.mark.parametrize("part", ["net.4.weight", "module.C"])
 def test_target_networks_hold_the_network_and_the_qp_and_move_softly(part):
     mpc, theta, operator = scheduled()
-    loss = QPQLearningLoss(critic_of(theta, operator), delay_value=True)
-    loss.make_value_estimator(gamma=0.9)
+    loss = make_loss(operator=critic_of(theta, operator), delay_value=True)
     update = SoftUpdate(loss, tau=0.25)
 
     def last(params: Any) -> Tensor:
@@ -170,9 +169,7 @@ def test_the_state_dict_holds_the_network():
         torch.manual_seed(seed)
         with torch.no_grad():
             theta.net[-1].weight.normal_()
-        loss = QPQLearningLoss(critic_of(theta, operator), delay_value=True)
-        loss.make_value_estimator(gamma=0.9)
-        return theta, loss
+        return theta, make_loss(operator=critic_of(theta, operator), delay_value=True)
 
     (theta, loss), (other, fresh) = build(1), build(2)
     assert not torch.equal(theta.net[-1].weight, other.net[-1].weight)

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from tests import store
 from tests.problems import normal, random_mpc
-from tests.transitions import transitions
+from tests.transitions import make_loss, transitions
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,
@@ -24,15 +24,13 @@ from torch_qpmpc.learning.replay import ACTIVE_SET, windows_to_tau
 from torch_qpmpc.learning.updates import first_order, rate_of_C, second_order
 
 
-def make_loss(mpc, key: str | None = None, **options) -> QPQLearningLoss:
-    loss = QPQLearningLoss(QPActorValueOperator(mpc, active_set_key=key), **options)
-    loss.make_value_estimator(gamma=0.9)
-    return loss
+def loss_of(mpc, key: str | None = None, **options) -> QPQLearningLoss:
+    return make_loss(operator=QPActorValueOperator(mpc, active_set_key=key), **options)
 
 
 def test_the_first_order_descends_the_sum_of_its_terms():
     mpc = random_mpc(3)
-    twin, loss = copy.deepcopy(mpc), make_loss(mpc)
+    twin, loss = copy.deepcopy(mpc), loss_of(mpc)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     optimizer = torch.optim.SGD(mpc.parameters(), lr=1e-3)
     update = first_order(mpc, loss, optimizer, Penalties(si=si))
@@ -40,7 +38,7 @@ def test_the_first_order_descends_the_sum_of_its_terms():
     assert terms.pop("train/accepted") == 1
     assert set(terms) == {"loss/value", "loss/si"}
     assert scalars["unsolved"] == 0
-    total = make_loss(twin)(transitions())["loss_value"] + si(twin.C, windows, twin.b.detach())
+    total = loss_of(twin)(transitions())["loss_value"] + si(twin.C, windows, twin.b.detach())
     total.backward()
     assert_close(sum(terms.values()), total)
     for moved, still in zip(mpc.parameters(), twin.parameters(), strict=True):
@@ -60,7 +58,7 @@ def test_the_first_order_descends_the_sum_of_its_terms():
 )
 def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, options, step):
     mpc = random_mpc(3)
-    twin, loss = copy.deepcopy(mpc), make_loss(mpc, **options)
+    twin, loss = copy.deepcopy(mpc), loss_of(mpc, **options)
     si, windows = SystemIdentificationPenalty(1e-2), normal(5, mpc.n_z)
     before, batch = mpc.C.detach().clone(), transitions(20)
     optimizer = GaussNewton(mpc, damping=10.0)
@@ -68,13 +66,13 @@ def test_the_second_order_steps_towards_the_loss_modules_targets(with_si, option
     if "weights" in step:
         batch["priority_weight"] = step["weights"]
     terms, scalars = update(batch, windows if with_si else None)
-    expected = make_loss(twin, td_error_clip=options.get("td_error_clip"))(transitions(20))
+    expected = loss_of(twin, td_error_clip=options.get("td_error_clip"))(transitions(20))
     assert_close(terms["loss/value"], expected["loss_value"].detach())
     assert ("loss/si" in terms) == with_si
     for name in ("td_error", "pred_value", "target_value", "unsolved"):
         assert_close(scalars[name], expected[name])
     with torch.no_grad():
-        target = make_loss(twin).target(transitions(20))
+        target = loss_of(twin).target(transitions(20))
         s, a = batch["observation"], batch["action"]
         penalty = si.curvature(windows) if with_si else None
         GaussNewton(twin, damping=10.0).step(s, a, -target, penalty=penalty, **step)
@@ -90,8 +88,7 @@ def test_a_preview_and_an_observation_move_theta_as_one_observation_does(second)
     moved = []
     for key in ("preview", None):
         mpc = store.make_mpc()
-        loss = QPQLearningLoss(QPActorValueOperator(mpc, preview_key=key))
-        loss.make_value_estimator(gamma=0.9)
+        loss = make_loss(operator=QPActorValueOperator(mpc, preview_key=key))
         si = SystemIdentificationPenalty(1e-2)
         if second:
             update = second_order(mpc, loss, GaussNewton(mpc), Penalties(si=si))
@@ -113,7 +110,7 @@ def test_a_preview_and_an_observation_move_theta_as_one_observation_does(second)
 @pytest.mark.parametrize("second", [True, False])
 def test_invalid_rewards_are_counted_under_their_own_name(second):
     mpc = random_mpc(3, on_failure="mask")
-    loss, batch = make_loss(mpc), transitions()
+    loss, batch = loss_of(mpc), transitions()
     batch["action"][2] = 9.0  # beyond a hard bound
     batch["next", "reward"][4] = torch.nan
     if second:
@@ -139,7 +136,7 @@ def test_an_update_without_a_usable_transition_moves_nothing(cause, second):
     make: Any = second_order if second else first_order
     adam = torch.optim.Adam(mpc.parameter_groups(RATES), weight_decay=0.1)
     optimizer: Any = GaussNewton(mpc) if second else adam
-    update = make(mpc, make_loss(mpc), optimizer, Penalties(deviation, si))
+    update = make(mpc, loss_of(mpc), optimizer, Penalties(deviation, si))
     update(transitions(), windows)
     before = copy.deepcopy((mpc.state_dict(), optimizer.state_dict()["state"]))
     batch = transitions()
@@ -160,7 +157,7 @@ RATES = {"cost": 1e-2, "constraints": 1e-3}
 
 
 def make_update(name: str, mpc: QPMPC, deviation: DeviationPenalty):
-    loss = make_loss(mpc, td_error_clip=1.0)
+    loss = loss_of(mpc, td_error_clip=1.0)
     if name == "gauss_newton":
         optimizer = GaussNewton(mpc)
         return second_order(mpc, loss, optimizer, Penalties(deviation)), optimizer
@@ -190,7 +187,7 @@ def test_a_gradient_step_with_its_proximal_step_is_the_papers():
     deviation = DeviationPenalty(mpc, c_1=1e-2, c_2=1e-4)
     twin = copy.deepcopy(mpc)
     make_update("sgd", mpc, deviation)[0](transitions(), None)
-    make_loss(twin, td_error_clip=1.0)(transitions())["loss_value"].backward()
+    loss_of(twin, td_error_clip=1.0)(transitions())["loss_value"].backward()
     assert twin.C.grad is not None
     start, gradient = twin.C.detach().numpy(), twin.C.grad.numpy()
     step = cp.Variable(start.shape)
@@ -224,7 +221,7 @@ def test_the_penaltys_weight_falls_with_the_rate_of_C(optimizer):
 def test_the_deviation_penalty_needs_the_rate_of_a_free_C():
     """It finds C in groups without names, and says so before theta moves."""
     mpc = random_mpc(3, free=0.0)
-    deviation, loss = DeviationPenalty(mpc), make_loss(mpc, td_error_clip=1.0)
+    deviation, loss = DeviationPenalty(mpc), loss_of(mpc, td_error_clip=1.0)
     optimizer = torch.optim.SGD(mpc.parameters(), 1e-3)
     first_order(mpc, loss, optimizer, Penalties(deviation))(transitions(), None)
     moved = (mpc.C - mpc.C_0).detach().abs()
@@ -236,12 +233,12 @@ def test_the_deviation_penalty_needs_the_rate_of_a_free_C():
     fixed = random_mpc(3, learn=("H",))
     penalties = Penalties(DeviationPenalty(fixed))
     with pytest.raises(QPError, match="optimizer: got one that does not move C, expected"):
-        second_order(fixed, make_loss(fixed), GaussNewton(fixed), penalties)
+        second_order(fixed, loss_of(fixed), GaussNewton(fixed), penalties)
 
 
 def test_the_second_order_keeps_active_sets():
     mpc = random_mpc(3)
-    loss = make_loss(mpc, ACTIVE_SET)
+    loss = loss_of(mpc, ACTIVE_SET)
     batch = transitions()
     expected = mpc.solve(batch["observation"], batch["action"]).active
     second_order(mpc, loss, GaussNewton(mpc), Penalties())(batch, None)

@@ -11,19 +11,12 @@ from torch.testing import assert_close
 import train
 from tests.problems import random_mpc
 from tests.runs import SMALL, make_config
-from tests.transitions import transitions
-from torch_qpmpc import QPActorValueOperator, QPQLearningLoss, SolveLog
+from tests.transitions import make_loss, transitions
+from torch_qpmpc import QPActorValueOperator, SolveLog
 from torch_qpmpc.learning.replay import ACTIVE_SET, ACTIVE_SETS, Replay
 from torch_qpmpc.qp.program import UNKNOWN
 
 COUNT = 12
-
-
-def make_loss(key: str | None, solver: str = "daqp", **options) -> QPQLearningLoss:
-    operator = QPActorValueOperator(random_mpc(3, solver=solver), active_set_key=key)
-    loss = QPQLearningLoss(operator, **options)
-    loss.make_value_estimator(gamma=0.9)
-    return loss
 
 
 def test_an_operator_reads_and_writes_the_active_set():
@@ -45,8 +38,8 @@ def test_an_operator_reads_and_writes_the_active_set():
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
 def test_the_loss_keeps_the_active_sets_of_both_problems(solver):
-    delay_value = solver == "daqp"
-    loss = make_loss(ACTIVE_SET, solver, delay_value=delay_value)
+    operator = QPActorValueOperator(random_mpc(3, solver=solver), active_set_key=ACTIVE_SET)
+    loss = make_loss(operator=operator, delay_value=solver == "daqp")
     td = transitions()
     mpc = copy.deepcopy(loss.operator.module)
     with SolveLog() as first:

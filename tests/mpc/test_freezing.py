@@ -14,7 +14,7 @@ from tests.gauss_newton import Reference
 from tests.mpc.settings import rows
 from tests.problems import central_difference, random_mpc, random_states
 from tests.refused import refused
-from tests.transitions import make_batch
+from tests.transitions import make_batch, make_loss
 from torch_qpmpc import (
     QPMPC,
     DeviationPenalty,
@@ -92,8 +92,7 @@ def test_the_proximal_step_of_an_update_leaves_frozen_entries():
     mpc = masked(mask, action_slack=10.0)
     with torch.no_grad():
         mpc.leaves("C")[0].add_(0.3)
-    loss = QPQLearningLoss(QPActorValueOperator(mpc))
-    loss.make_value_estimator(gamma=0.9)
+    loss = make_loss(operator=QPActorValueOperator(mpc))
     groups = mpc.parameter_groups({"cost": 0.0, "constraints": 0.0})
     penalty = DeviationPenalty(mpc, c_1=0.1, c_2=0.1, c_3=0.1)
     update = first_order(mpc, loss, torch.optim.SGD(groups, lr=0.0), Penalties(penalty))
@@ -231,10 +230,7 @@ def test_a_converted_state_dict_is_loaded(convert):
 
 def test_the_state_of_another_qpmpcs_loss_is_refused():
     def loss(**options: Any) -> QPQLearningLoss:
-        operator = QPActorValueOperator(random_mpc(0, **options))
-        made = QPQLearningLoss(operator)
-        made.make_value_estimator(gamma=0.9)
-        return made
+        return make_loss(operator=QPActorValueOperator(random_mpc(0, **options)))
 
     state = loss().state_dict()
     loss().load_state_dict(state)

@@ -18,7 +18,7 @@ import torch_qpmpc as qm
 from tests.figures import make_mpc
 from tests.problems import BRINK, HARD_ROWS, MIXED, SOFT_ROWS, WEAK, known_qp, normal, random_mpc
 from tests.problems import random_states as states
-from tests.transitions import transitions
+from tests.transitions import make_loss, transitions
 from torch_qpmpc.envs import LinearSystemEnv, PointMass
 from torch_qpmpc.qp.pipeline import solve
 from torch_qpmpc.qp.solution import QPSolution
@@ -151,8 +151,7 @@ def learned(device: torch.device) -> tuple[Tensor, list[Tensor]]:
     """Return a loss and theta after a `GaussNewton` step on fixed transitions."""
     mpc = random_mpc(solver="torch").to(device)
     operator = qm.QPActorValueOperator(mpc, active_set_key="active_set")
-    loss_module = qm.QPQLearningLoss(operator)
-    loss_module.make_value_estimator(gamma=0.9)
+    loss_module = make_loss(operator=operator)
     batch = transitions(30)
     with torch.no_grad():
         cost = mpc.action_value(batch["observation"].to(device), batch["action"].to(device)).cpu()
