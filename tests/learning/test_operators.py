@@ -9,6 +9,7 @@ from tensordict import TensorDict
 
 from tests.store import collect
 from tests.store import make_mpc as make_store_mpc
+from tests.transitions import make_operator
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPError, SolveLog, SolverError
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop
@@ -19,14 +20,8 @@ from torch_qpmpc.qp.solvers import BACKENDS
 BATCHES = [(), (3,), (2, 3)]
 
 
-def make_mpc(**options: Any) -> QPMPC:
-    settings = {
-        "state_bounds": ([-1.0, -1.0], [1.0, 1.0]),
-        "action_bounds": ([-1.0], [1.0]),
-        "stage_weight": [1.0, 0.5, 0.1],
-        "solver": "daqp",
-    } | options
-    return QPMPC.from_model([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], 3, **settings)
+def make_mpc() -> QPMPC:
+    return make_operator().module
 
 
 def make_inputs(*batch: int, dtype: torch.dtype = torch.float64) -> TensorDict:
