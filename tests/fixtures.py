@@ -74,10 +74,15 @@ def quick_exports() -> Iterator[None]:
 
 
 @pytest.fixture
-def rough_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_orders(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Try no orders far above those of the tests' plants."""
+    monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4))
+
+
+@pytest.fixture
+def rough_fits(monkeypatch: pytest.MonkeyPatch, few_orders: None) -> None:
     """Fit models, networks and costs roughly: the tests of mpc compare the fits."""
     monkeypatch.setattr(learned, "STEPS", 200)
-    monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4))
     monkeypatch.setattr(subspace, "LAGS", (2, 10))
     monkeypatch.setattr(subspace, "MANY", 8)
     monkeypatch.setattr(stage_cost, "ITERATIONS", 50)

@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
-from torch_qpmpc.identification import innovations, subspace
+from torch_qpmpc.identification import innovations
 from torch_qpmpc.identification.identification import identify
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.log import Trajectory
@@ -14,14 +14,10 @@ from torch_qpmpc.identification.subspace import fit_state_space, held_out_errors
 A = np.array([[0.9, 0.2, 0.0], [-0.2, 0.9, 0.1], [0.0, 0.0, 0.7]])
 B = np.array([[0.0, 0.1], [0.5, 0.0], [0.0, 1.0]])
 C = np.array([[1.0, 0.0, 0.0], [0.0, 0.5, 0.5]])
+pytestmark = pytest.mark.usefixtures("few_orders")
+
 # Each noise has its own source.
 Q, R = 0.01 * np.eye(3), np.diag([0.04, 0.02])
-
-
-@pytest.fixture(autouse=True)
-def few_orders(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Try no orders far above those of the plants."""
-    monkeypatch.setattr(subspace, "ORDERS", (1, 2, 3, 4, 5, 6))
 
 
 def trajectory(y, u, d=None) -> Trajectory:
