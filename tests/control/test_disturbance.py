@@ -57,6 +57,7 @@ def of_a_lag(
     return {"y": np.array(y), "u": np.array(u)}
 
 
+@pytest.mark.usefixtures("few_orders")
 @pytest.mark.parametrize("pole", [0.98, 1.0])
 def test_after_a_log_that_drifts_a_load_leaves_no_tail(pole, tmp_path):
     """The target did not know of the drift: a fifth of a load stayed for hundreds of steps."""

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -26,6 +27,7 @@ from torch_qpmpc.learning.closed_loop import (
 )
 
 
+@functools.cache
 def logged(loops: int = 8, steps: int = 60) -> Identified:
     """A model of an oscillator whose position alone is measured, with noise."""
     rng = np.random.default_rng(0)
