@@ -115,27 +115,21 @@ def test_a_pair_that_loses_more_than_the_bound_is_a_veto(bound):
     assert test.decision == "worse"
 
 
-def test_equal_differences_say_nothing_without_a_bound():
-    for bound, decision in ((None, "open"), (1.0, "better")):
-        test = PairedTest(bound=bound)
-        test.add(torch.full((40,), -0.5))
-        assert test.decision == decision
-
-
-def test_few_pairs_decide_nothing():
-    test = PairedTest(bound=5.0)
-    test.add(torch.full((15,), -5.0))
-    assert test.decision == "open"
-    test.add(torch.tensor([-5.0]))
-    assert test.decision == "better"
-
-
 @pytest.mark.parametrize(
-    ("value", "decision"), [(math.inf, "worse"), (math.nan, "worse"), (-math.inf, "better")]
+    ("value", "count", "bound", "decision"),
+    [
+        (-0.5, 40, None, "open"),  # equal differences say nothing without a bound
+        (-0.5, 40, 1.0, "better"),
+        (-5.0, 15, 5.0, "open"),  # few pairs decide nothing
+        (-5.0, 16, 5.0, "better"),
+        (math.inf, 1, None, "worse"),  # a policy that fails is worse
+        (math.nan, 1, None, "worse"),
+        (-math.inf, 1, None, "better"),
+    ],
 )
-def test_a_policy_that_fails_is_worse(value, decision):
-    test = PairedTest()
-    test.add(torch.tensor([value]))
+def test_equal_differences_decide(value, count, bound, decision):
+    test = PairedTest(bound=bound)
+    test.add(torch.full((count,), value))
     assert test.decision == decision
 
 
