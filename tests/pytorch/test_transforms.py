@@ -13,12 +13,10 @@ from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, stac
 from torch.testing import assert_close
 
 from tests.problems import known_qp, normal, random_mpc, random_states
+from tests.qp.test_derivatives import OPERANDS, PARTS, part_of
 from tests.refused import refused
-from torch_qpmpc import QPMPC, QuadraticProgram, solve_qp
-from torch_qpmpc.qp.program import EVENT_SHAPES
+from torch_qpmpc import QPMPC
 
-OPERANDS = (*EVENT_SHAPES, "fixed")
-PARTS = ("value", "z", "sigma", "chi", "upsilon", "eta", "xi")
 Features = dict[str, Callable[[QPMPC, dict[str, Tensor], Tensor, Tensor], Tensor]]
 
 
@@ -120,9 +118,7 @@ def test_forward_mode_equals_reverse_mode(part, name):
     tangent = normal(*operands[index].shape, seed=index)
 
     def of_one(operand: Tensor) -> Tensor:
-        moved = [*operands[:index], operand, *operands[index + 1 :]]
-        qp = QuadraticProgram(*moved[:-1], check_values=False)
-        return getattr(solve_qp(qp, moved[-1], solver="daqp"), part)
+        return part_of([*operands[:index], operand, *operands[index + 1 :]], part)
 
     out, pushed, *_ = jvp(of_one, (operands[index],), (tangent,))
     weight = normal(*out.shape, seed=4)
