@@ -226,18 +226,31 @@ def test_hard_rows_that_contradict_each_other_are_refused(tmp_path):
 
 
 @needs_compiler
-def test_a_limit_that_solves_nothing_is_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("part", "at", "by", "match"),
+    [
+        (
+            "codes",
+            slice(None),
+            1,
+            "max_iterations: got 3, with none of 40 states solved, expected ",
+        ),
+        ("u", 3, 1e-3, r"dtype: got 'float64', with an action off by \d\.\de-0\d of its size"),
+    ],
+)
+def test_a_limit_that_solves_nothing_and_another_action_at_any_state_are_refused(
+    part, at, by, match, tmp_path, monkeypatch
+):
     steps = Library.steps
 
-    def unsolved(self, *arguments):
+    def off(self, *arguments):
         found = steps(self, *arguments)
-        found.codes[:] = 1
+        getattr(found, part)[at] += by
         return found
 
-    monkeypatch.setattr(Library, "steps", unsolved)
-    match = "max_iterations: got 3, with none of 40 states solved, expected a limit that solves"
-    with pytest.raises(QPError, match=match):
-        export_c(tied(), tmp_path, max_iterations=3)
+    monkeypatch.setattr(Library, "steps", off)
+    with pytest.raises(QPError, match=f"^{match}"):
+        export_c(tied(), tmp_path, max_iterations=3 if part == "codes" else None)
 
 
 @needs_compiler
@@ -366,21 +379,6 @@ def test_a_policy_whose_actions_are_mostly_zero_is_exported(tmp_path):
     mpc = qm.LinearMPC(model, 4, R=1.0, y_bounds=(-300.0, 1e10), u_bounds=(-1.5, 1.0))
     for policy in (mpc.plan, mpc.targets):
         export_c(policy, tmp_path)
-
-
-@needs_compiler
-def test_actions_that_differ_at_any_state_are_refused(tmp_path, monkeypatch):
-    steps = Library.steps
-
-    def off(self, *arguments):
-        results = steps(self, *arguments)
-        results.u[3] += 1e-3
-        return results
-
-    monkeypatch.setattr(Library, "steps", off)
-    match = r"^dtype: got 'float64', with an action off by \d\.\de-0\d of its size"
-    with pytest.raises(QPError, match=match):
-        export_c(tied(), tmp_path)
 
 
 @needs_compiler
