@@ -88,7 +88,7 @@ def test_a_log_says_that_loops_start_off_rest(model):
     for y in (0.0, np.nan):
         controller.step([y], [1.0])
     assert controller.learn(Lag(start=3.0), **QUICK).accepted
-    observer, e = controller.observer, controller.observer.at_rest(controller.u, none, [1.0])
+    observer, e = controller.observer, controller.observer.at_rest(controller.u, none, np.ones(1))
     for y in (1.0, 0.8):  # starts again, from rest, with the steady gain: the gap is forgotten
         controller.step([y], [1.0])
         e = observer.predicted(e + observer.L @ (y - observer.H @ e), controller.u, none)
