@@ -13,6 +13,7 @@ from tests.covering import covering
 from tests.problems import KnownQP, known_qp, programs_of
 from torch_qpmpc import QPMPC, QuadraticProgram, SolveLog, Status, solve_qp
 from torch_qpmpc.qp.pipeline.batch import Programs
+from torch_qpmpc.qp.pipeline.scaling import lengths
 from torch_qpmpc.qp.program import TOLERANCE
 from torch_qpmpc.qp.solution import QPSolution
 from torch_qpmpc.qp.solvers import BACKENDS
@@ -92,7 +93,18 @@ def test_entries_that_all_but_vanish_set_no_unit(solver, seed):
     assert_close(solution.value, solve_qp(plain, s, solver=solver).value, rtol=1e-6, atol=0)
     units = Programs.of(*noisy.tensors(), s)[0].prepared.units
     assert units is not None
-    assert units.length.max() < 100 * units.length.min()
+    assert units.length.max() < 1000 * units.length.min()
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_units_of_inputs_reach_through_dead_times(unit):
+    """Few passes left inputs of 1e6 a millionth of their unit, and plans on levels not the best."""
+    A, B = np.eye(5, k=1) + np.diag([0.9, 0.0, 0.0, 0.0, 0.0]), np.eye(5, 1, -4)
+    mpc = QPMPC.from_model(A, B, 8, stage_weight=[1.0, 0.0, 0.0, 0.0, 0.0, 0.1])
+    H, _, _, C = (x.detach().numpy()[None] for x in mpc.quadratic_program().tensors()[:4])
+    size = np.where(np.arange(C.shape[-1]) % 6, unit, 1.0)
+    moved = lengths(H / np.outer(size, size), C / size) / size / lengths(H, C)
+    assert moved.max() <= 4 * moved.min()
 
 
 def test_a_hard_bound_holds_where_states_are_large_and_actions_small(solver):

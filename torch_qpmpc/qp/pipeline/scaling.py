@@ -26,8 +26,8 @@ from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 SMALL, LARGE = 2.0**-7, 2.0**10
 #: Columns that differ by more than this factor have units of their own, ..
 APART = 2.0**14
-#: .. after so many passes of equilibration.
-PASSES = 8
+#: .. after so many passes of equilibration, which carry a unit through a dead time.
+PASSES = 64
 #: QPs share a length if theirs, as powers of two, have the same quotient by this.
 ALIKE = 7
 #: Entries below this, relative to the largest, may be what rounding leaves of zeros.
