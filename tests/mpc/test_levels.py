@@ -223,6 +223,8 @@ def test_a_search_that_ends_early_says_so_with_its_gap():
     assert solution.value >= best.value * (1 - 1e-9)
     assert solution.value - best.value <= solution.value_error * solution.value.abs() + 1e-9
     assert solution.iterations == 24
+    with pytest.raises(qm.SolverError, match=r"1 NOT_CONVERGED: .* more max_nodes"):
+        qm.QPMPC.of(**mpc.arguments | {"max_nodes": 1}).solve(s)
 
 
 def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):

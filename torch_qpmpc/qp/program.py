@@ -78,7 +78,7 @@ _EXPLANATIONS = {
     Status.NOT_CONVERGED: "no solver reached the certificate's tolerance, and the QP is neither "
     "provably infeasible nor unbounded; it may be ill-conditioned, like the predictions of an "
     "unstable model over a long horizon: shorten the horizon, give the model a stabilising "
-    "feedback u = K x + v, or rescale the QP",
+    "feedback u = K x + v, or rescale the QP; or a search for levels needs more max_nodes",
     Status.NODE_LIMIT: "the plan keeps levels and minimum times, and a better one may exist: the "
     "search ended at its number of nodes; pass a shorter integer_horizon, or more max_nodes",
     Status.INVALID_DATA: "NaN or inf in the data, lb > ub, or an H that is not positive "
