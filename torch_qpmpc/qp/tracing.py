@@ -24,22 +24,18 @@ PLAIN = frozenset((Tensor, nn.Parameter))
 BATCHED_GRADIENTS = torch._C._dispatch_key_parse("VmapMode")
 
 
-def is_hidden(tensors: Sequence[Tensor]) -> bool:
-    """True if a trace, a transform or a tensor class may hide the values."""
+def has_values(*tensors: Tensor) -> bool:
+    """True if Python may branch on the values: no trace, transform or tensor class hides them."""
     core = torch._C
-    return (
+    return not (
         torch.compiler.is_compiling()
         or core._len_torch_dispatch_stack() > 0  # fake tensors, `make_fx`
         or core._get_tracing_state() is not None  # `torch.jit.trace`
         or core._dispatch_tls_is_dispatch_key_included(BATCHED_GRADIENTS)
         or _functorch.peek_interpreter_stack() is not None  # `torch.func`
         or not PLAIN.issuperset(map(type, tensors))  # tensors that fake or wrap others
+        or any(x.is_meta for x in tensors)
     )
-
-
-def has_values(*tensors: Tensor) -> bool:
-    """True if Python may branch on the tensors' values."""
-    return not is_hidden(tensors) and not any(x.is_meta for x in tensors)
 
 
 def is_eager(tensors: Sequence[Tensor]) -> bool:

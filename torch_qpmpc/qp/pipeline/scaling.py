@@ -26,8 +26,9 @@ from torch_qpmpc.qp.pipeline.arrays import Array, BatchSolution, Theta, per_qp
 SMALL, LARGE = 2.0**-7, 2.0**10
 #: Columns that differ by more than this factor have units of their own, ..
 APART = 2.0**14
-#: .. after so many passes of equilibration, which carry a unit through a dead time.
-PASSES = 64
+#: .. after so many passes of equilibration, which carry a unit through a dead time, or fewer if one
+#: moves no unit by more than this, as a logarithm.
+PASSES, STILL = 64, 0.02
 #: QPs share a length if theirs, as powers of two, have the same quotient by this.
 ALIKE = 7
 #: Entries below this, relative to the largest, may be what rounding leaves of zeros.
@@ -168,7 +169,9 @@ def lengths(H: np.ndarray, rows: np.ndarray) -> np.ndarray:
         for _ in range(PASSES):
             scaled = sizes + units[first] + units[second]
             scaled -= typical(line[kept], scaled[kept], M * r + M)[line]
-            units[:-1] -= step * typical(second[kept], scaled[kept], M * n)
+            units[:-1] -= (move := step * typical(second[kept], scaled[kept], M * n))
+            if np.abs(move).max() <= STILL:
+                break
         return units[:-1].reshape(M, n), scaled
 
     units, scaled = equilibrated(_largest, np.bincount(line)[line] > 1, 0.5)
