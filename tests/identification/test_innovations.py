@@ -5,6 +5,7 @@ import pytest
 import scipy.linalg
 import torch
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification import innovations
 from torch_qpmpc.identification.identification import identify
 from torch_qpmpc.identification.innovations import Innovations
@@ -200,3 +201,9 @@ def test_order_and_lags_are_those_of_the_least_held_out_errors():
     assert (whiteness(fit.model, data) >= 0.8).all()
     coloured = fit.model._replace(L=0 * fit.model.L)
     assert whiteness(coloured, data).max() < 0.6
+
+
+def test_trajectories_that_are_all_too_short_are_named():
+    short = trajectory(np.zeros((9, 2)), np.zeros((8, 2)))
+    with pytest.raises(QPError, match=r"^trajectories: got none of 10 steps without gaps, expec"):
+        fit_state_space([short] * 3, 2, 10)

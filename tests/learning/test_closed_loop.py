@@ -259,10 +259,13 @@ def test_pieces_of_a_single_trajectory_make_an_ensemble(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_ensemble_leaves_out_trajectories_too_short_for_a_fit(found, seed):
-    one = found.log.trajectories[0]
-    short = Trajectory(one.y[:3], one.u[:2], one.d[:2])
-    log = dataclasses.replace(found.log, trajectories=[*found.log.trajectories[:2], *[short] * 14])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_an_ensemble_leaves_out_draws_of_trajectories_too_short_for_a_fit(found, seed, gaps):
+    long = found.log.trajectories[:2]
+    y, u, d = (x.clone() for x in long[0])
+    y[2:-2] = torch.nan
+    short = Trajectory(y, u, d) if gaps else Trajectory(*(x[:2] for x in (long[0].y, u[:1], d[:1])))
+    log = dataclasses.replace(found.log, trajectories=[*long, *[short] * 14])
     assert len(ensemble(dataclasses.replace(found, log=log), 12, seed)) == 12
 
 

@@ -98,9 +98,8 @@ def _cost(design: Design, layout: Layout) -> Cost:
             stage[j, i] += 1
         else:
             linear[i] += price
-    one = places["one"].start
+    one, size = places["one"].start, places["u"].start
     stage[one, one] = 2 * SCALE * design.typical
-    size = places["u"].start
     P, end = riccati(design), off[:, :size]
     x = np.vstack((s["x"], s["u_last"]))[:, :size]
     if P is None:

@@ -145,8 +145,7 @@ def kalman(design: Design, noise: Array, drift: Array) -> Observer:
         got = "a model whose Kalman filter does not converge"
         remedy = "It has a mode on the unit circle that no input moves: remove it."
         raise QPError.expected("model", got, "a model with a steady-state filter", remedy)
-    start, gains, S = np.zeros(n + n_w), L[None], H @ P @ H.T + V
-    first = np.zeros_like(P)
+    start, gains, S, first = np.zeros(n + n_w), L[None], H @ P @ H.T + V, np.zeros_like(P)
     if plant.visited is not None:
         start[:n] = plant.visited[0]
         loads = np.diag((moving(design, SMALL * design.usual) / of_w) ** 2)

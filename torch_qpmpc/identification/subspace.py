@@ -21,6 +21,7 @@ import scipy  # imports its parts at their first use: a fifth of a second
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
+from torch_qpmpc.errors import QPError
 from torch_qpmpc.identification.filter import Array, grouped
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.identification.likelihood import (
@@ -562,6 +563,8 @@ def _predictor(
             w = np.hstack((y[:-1], v[:, :-1]))
             windows.append(sliding_window_view(w.ravel(), lags * w.shape[1])[:: w.shape[1]])
             after.append(Signals(y[lags:], v[lags:]))
+    if not windows:
+        raise QPError.expected("trajectories", f"none of {lags} steps without gaps", "a longer one")
     Z, F = np.concatenate(windows), np.concatenate([y for y, _ in after])
     Z, q = np.hstack((Z, np.ones((len(Z), 1)))), Z.shape[1] // lags
     W = ridge(torch.as_tensor(Z), torch.as_tensor(F)).numpy()

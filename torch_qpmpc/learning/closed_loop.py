@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -43,8 +44,8 @@ LEVEL = 0.01
 LEAST = 0.01
 #: Models of an ensemble, every THIRD of which trains theta.
 MEMBERS, THIRD = 12, 3
-#: The least steps of a piece of a log that is drawn again, in lags of its model and one.
-PIECE = 4
+#: The least steps of a piece of a log, in lags of its model and one; the most draws of a member.
+PIECE, DRAWS = 4, 10
 #: Loops that decide are this many times as long as those of the gradients.
 LONGER = 4
 #: A loop that sees signals this many times as large as the first ones has failed.
@@ -223,18 +224,17 @@ def crossed(
 
 
 def ensemble(identified: Identified, members: int, seed: int) -> list[Innovations]:
-    """Return a model and those of trajectories of its log drawn with replacement.
-
-    A single trajectory is cut into pieces, which are drawn; those too short to fit are not.
-    """
-    fit = identified.fit
-    log = [x for x in identified.log.trajectories if x.steps > fit.lags]
+    """Return a model and those of its log's trajectories, or pieces of one, drawn again."""
+    log, fit = identified.log.trajectories, identified.fit
     if len(log) == 1:
         pieces = min(members, log[0].steps // (PIECE * (1 + fit.lags)))
         log = [part for (part,) in folds(log, max(pieces, 1))]
     rng, models = np.random.default_rng(seed), [fit.model]
-    for rows in rng.integers(len(log), size=((members - 1) * (len(log) > 1), len(log))):
-        models.append(fit_state_space([log[i] for i in rows], fit.order, fit.lags).model)
+    for rows in rng.integers(len(log), size=(DRAWS * members, len(log))):
+        if len(models) == members or len(log) == 1:
+            break
+        with suppress(QPError):  # of trajectories that are too short
+            models.append(fit_state_space([log[i] for i in rows], fit.order, fit.lags).model)
     return models
 
 
