@@ -224,7 +224,7 @@ def crossed(
 
 
 def ensemble(identified: Identified, members: int, seed: int) -> list[Innovations]:
-    """Return a model and those of its log's trajectories, or pieces of one, drawn again."""
+    """Return a model, and those of its trajectories or pieces of one, drawn with replacement."""
     log, fit = identified.log.trajectories, identified.fit
     if len(log) == 1:
         pieces = min(members, log[0].steps // (PIECE * (1 + fit.lags)))

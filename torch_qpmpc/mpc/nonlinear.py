@@ -406,15 +406,15 @@ class SequentialQP(nn.Module):
             pull[todo] *= torch.where(better, 1 / CHANGE, CHANGE)
             pull.clamp_(LEAST)
             done[todo] = converged[todo] | (pull[todo] > MOST)
-        found = BatchSolution(*parts)
-        left = (~converged & (found.status == 0)).nonzero().squeeze(1)
-        found.value[left] = merit(price, costs, over)[left]  # the plan in place of the QP's
-        found.z[left] = z[left]
-        found.status[left[found.value[left].isinf()]] = int(Status.INVALID_DATA)
-        y = times(qp.G, found.z)
+        kept = BatchSolution(*parts)
+        left = (~converged & (kept.status == 0)).nonzero().squeeze(1)
+        kept.value[left] = merit(price, costs, over)[left]  # the plan in place of the QP's
+        kept.z[left] = z[left]
+        kept.status[left[kept.value[left].isinf()]] = int(Status.INVALID_DATA)
+        y = times(qp.G, kept.z)
         over = (hard & (torch.maximum(qp.lb - y, y - qp.ub) > SLIP * bound)).any(1)
-        status = torch.where(over & (found.status == 0), failed, found.status)
-        return u, found._replace(status=status), converged
+        status = torch.where(over & (kept.status == 0), failed, kept.status)
+        return u, kept._replace(status=status), converged
 
     def _plans(self, qp: QuadraticProgram) -> Tensor:
         """Return plans ``(.., K, N, n_u)``, held at zero and random within the bounds."""
