@@ -17,7 +17,7 @@ from torch_qpmpc.errors import QPError
 #: Where a wheel has its copies of train.py and configs/; in a clone they are beside the package.
 PACKAGED = Path(__file__).with_name("command")
 #: The version of the format that `save_file` writes and `load_file` reads.
-VERSION = 2
+VERSION = 3
 #: What to do about a damaged file of a run.
 RESTORE = "Restore the file, or move the run's folder elsewhere."
 
@@ -80,7 +80,7 @@ def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
         raise QPError.expected("path", got, expected, remedy)
     if (version := content.get("version")) != VERSION:
         got, remedy = f"{path}, whose format has version {version!r}", "Make the file again."
-        if version != 1:  # which no release wrote
+        if version not in range(1, VERSION):  # which no release wrote
             remedy = "A newer release wrote it: pip install --upgrade torch-qpmpc."
         raise QPError.expected("path", got, f"version {VERSION}", remedy)
     return content

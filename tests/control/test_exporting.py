@@ -195,7 +195,7 @@ def test_the_header_names_signals_and_the_report_has_the_size_of_the_state(tmp_p
     header = (tmp_path / "level.h").read_text()
     assert "y and r: level [m]" in header
     assert "known: rain, price" in header
-    assert f"state {report.state_bytes} bytes" in str(report)
+    assert f"state {report.state_bytes:,} bytes" in str(report)
     assert report.state_bytes == load(report.files, controller, "level").state_bytes
 
 

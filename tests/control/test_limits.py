@@ -98,7 +98,7 @@ def wild(steps: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("references", ["held", "preview"])
 def test_c_keeps_the_same_limits(references):
-    pair = exported(plant, missing=True, references=references, du_bounds=(-0.5, 0.5))
+    pair = exported(plant, missing=True, references=references, du_bounds=(-0.5, 0.5), y_slack=5.0)
     difference, counts = soak(*pair, 400, 2, 0, size=8.0)
     assert difference < 1e-8
     assert {*counts} >= {"SOLVED", "INFEASIBLE", "INVALID", "MISSING"}

@@ -151,14 +151,26 @@ def test_a_plan_rests_where_a_zone_or_the_input_stops_it(horizon, bounds):
 
 def test_a_set_point_is_weighed_but_for_what_bounds_of_outputs_hold_off():
     mpc = coupled(u_bounds=(-1.0, 1.0)).mpc
-    held, pushed, free = mpc.target([[2.0, 0.0], [-3.0, 0.0], [0.3, 0.0]]).r[:, 0]
+    held, pushed, free = mpc.target([[2.0, 0.0], [-3.0, 0.0], [0.3, 0.0]]).end[:, 0]
     assert np.allclose([held, pushed, free], [0.5, -0.5, 0.3], atol=1e-7)
     narrow = coupled(u_bounds=(-0.1, 0.1)).mpc
-    assert np.allclose(narrow.target([2.0, 0.0]).r[0], 2.0), "the input's bound alone"
+    assert np.allclose(narrow.target([2.0, 0.0]).end[0], 2.0), "the input's bound alone"
     hot = coupled(u_bounds=(-1.0, 1.0), y_bounds={"y2": (2.0, 3.0)}).mpc.target([-3.0, 0.0])
-    assert np.allclose([hot.y[0], hot.r[0]], 1.0), "the zone pulls the other way"
+    assert np.allclose([hot.y[0], hot.end[0]], 1.0), "the zone pulls the other way"
     own = coupled(u_bounds=(-1.0, 1.0), y_bounds={"y1": (2.0, 3.0)}).mpc.target([2.5, 0.0])
-    assert np.allclose([own.y[0], own.r[0]], [1.0, 2.5]), "both pull the same way"
+    assert np.allclose([own.y[0], own.end[0]], [1.0, 2.5]), "both pull the same way"
+
+
+@pytest.mark.parametrize("options", [{}, {"references": "preview"}, {"u_bounds": (-0.3, 0.3)}])
+@pytest.mark.parametrize("horizon", [2, 20])
+def test_a_bound_is_left_as_far_as_its_price_pays(horizon, options):
+    """(y - 2)^2 + (y - 1) / 2 is least at 1.75, which u = 0.3 does not reach."""
+    bounds: Any = {"y_bounds": (None, 1.0), "y_slack": 0.5, "u_bounds": (-9.0, 9.0), **options}
+    controller, y = qm.Controller(qm.LinearMPC(([[0.9]], [[0.5]]), horizon, Q=1.0, **bounds)), 0.0
+    for _ in range(200):
+        y = 0.9 * y + 0.5 * controller.step([y], [2.0])[0]
+    rest = 1.5 if "u_bounds" in options else 1.75
+    assert y == pytest.approx(rest, abs=1e-6)
 
 
 def test_zones_alone_rest_where_the_inputs_cost_least():

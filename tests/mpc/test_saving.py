@@ -41,7 +41,7 @@ def small() -> QPMPC:
 
 def test_later_releases_read_the_format():
     """``python -m tests.mpc.test_saving`` has written the file."""
-    mpc = QPMPC.load(FOLDER / "saved-2.qpmpc")
+    mpc = QPMPC.load(FOLDER / "saved-3.qpmpc")
     p = np.array([[0.0, 0.1, 0.0, 0.2], [0.1, 0.2, 0.3, 0.9]])
     assert_close(mpc.predict(p), np.array([[-0.248052501107], [-0.5]]), rtol=0, atol=1e-9)
     assert mpc.learned == ("H", "c", "C")
@@ -69,8 +69,8 @@ def test_another_file_is_named(tmp_path):
         QPMPC.load(tmp_path / "none")
     for kind, version, message in (
         ("network", 1, "a saved network, expected a file that QPMPC.save wrote"),
-        ("QPMPC", 1, "whose format has version 1, expected version 2. Make the file again."),
-        ("QPMPC", 3, "whose format has version 3, expected version 2. A newer release w"),
+        ("QPMPC", 1, "whose format has version 1, expected version 3. Make the file again."),
+        ("QPMPC", 4, "whose format has version 4, expected version 3. A newer release w"),
     ):
         torch.save({"kind": kind, "version": version}, tmp_path / "other")
         with pytest.raises(QPError, match=f"^path: got .*/other, {message}"):

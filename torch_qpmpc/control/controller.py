@@ -250,12 +250,11 @@ class Controller:
     @classmethod
     def _of_stored(cls, content: Mapping[str, Any]) -> Controller:
         state = unpacked(content["controller"])
-        parts = {name: state.pop(name) for name in PARTS if name in state}
-        mpc, settings = LinearMPC.of_stored(content), (parts.get(x) for x in SETTINGS)
-        if "observer" in parts:  # else a file of an earlier release
-            parts["observer"] = Observer(**parts["observer"])
+        parts = {name: state.pop(name) for name in PARTS}
+        mpc, settings = LinearMPC.of_stored(content), (parts[x] for x in SETTINGS)
+        parts["observer"] = Observer(**parts["observer"])
         controller, own = cls.__new__(cls), Law.of(mpc, *settings)
-        law = own if (point := state.pop("point", None)) is None else own.around(point, aims=True)
+        law = own if (point := state.pop("point")) is None else own.around(point, aims=True)
         controller._law = law = ready(replace(law, **parts))
         controller._own = law if point is None else own
         controller._start(Memory(**state))

@@ -32,14 +32,15 @@ Y_SLACK = 1e3
 class Target(NamedTuple):
     """Steady states: x_s ``(*batch, n)``, u_s ``(*batch, m)`` and y_s ``(*batch, n_y)``.
 
-    The plan weighs the set-points r ``(*batch, n_y)``, see `Design.weighed`. They are tensors, or
-    arrays in a `Law`.
+    The plan's stages weigh the set-points r ``(*batch, n_y)``, and its terminal cost ``end``, see
+    `Design.end_set_points`. They are tensors, or arrays in a `Law`.
     """
 
     x: Any
     u: Any
     y: Any
     r: Any
+    end: Any
 
 
 class Bands(NamedTuple):
@@ -434,11 +435,11 @@ class Design:
         """The places of the two signals in `arranged` whose difference p has, by name and stage."""
         n, m, n_y, n_d = self.plant.sizes
         N, rows = self.horizon + 1, self.horizon + 1 if self.staged else 1
-        widths, stages = (n, n, m, n_y, n_y, m, n_d, n_d, 1, 1), (1, *[rows] * 4, 1, N, 1, 1, 1)
-        ends = np.cumsum(np.multiply(widths, stages))
-        x, x_s, u_s, y_s, r, u_last, known, nominal, zero, one = (
-            np.arange(end - k * width, end).reshape(k, width)
-            for k, width, end in zip(stages, widths, ends, strict=True)
+        widths, stages = (n, n, m, *[n_y] * 3, m, n_d, n_d, 1, 1), (1, *[rows] * 5, 1, N, 1, 1, 1)
+        stops = np.cumsum(np.multiply(widths, stages))
+        x, x_s, u_s, y_s, r, end, u_last, known, nominal, zero, one = (
+            np.arange(stop - k * width, stop).reshape(k, width)
+            for k, width, stop in zip(stages, widths, stops, strict=True)
         )
         of_r, (of_y, of_u), none = self.weighted, self.bounded, (zero[:, :0], zero[:, :0])
         held, varies = self.references == "held", self.staged and self.R.any()
@@ -449,6 +450,7 @@ class Design:
             "x": (x, x_s[-1:]),
             "u_last": (u_last, u_s[-1:]) if self.moves else none,
             "off": (y_s[-1:, of_r], r[-1:, of_r]) if held else none,
+            "end": (y_s[-1:, of_r], end[-1:, of_r]) if self.pulls[1].size else none,
             "y_s": (y_s[-1:, of_y], zero),
             "u_s": (u_s[-1:, of_u], zero),
             "one": (one, zero),
@@ -477,11 +479,11 @@ class Design:
         n, m, n_y, _ = self.plant.sizes
         r, rest = s[..., :n_y], v @ Z.T + s[..., n_y:] @ M.T
         x, u, y = rest[..., :n], rest[..., n : n + m], rest[..., n + m :]
-        return Target(x, u, y, self.weighed(arrays, r, y, lam))
+        return Target(x, u, y, r, self.end_set_points(arrays, r, y, lam))
 
     @cached_property
     def pulls(self) -> tuple[Array, Array]:
-        """The maps of y_s - r and of the last multipliers of the target to `weighed`'s pull."""
+        """The maps of y_s - r and of the target's last multipliers to the pull."""
         Y = self.steady.Y
         W, n_y = self.bands.W, len(Y)
         held = self.inner & (W @ np.vstack((Y, self.steady.U))).any(1)
@@ -489,8 +491,8 @@ class Design:
         moved = Y @ np.linalg.pinv(Y.T @ self.Q @ Y) @ Y.T
         return moved @ self.Q, moved @ W[held, :n_y].T / 2
 
-    def weighed(self, arrays: Any, r: Any, y_s: Any, lam: Any) -> Any:
-        """Return the set-points that the plan weighs: r, but for what bounds of outputs hold off.
+    def end_set_points(self, arrays: Any, r: Any, y_s: Any, lam: Any) -> Any:
+        """Return the terminal cost's set-points: r, but for what bounds of outputs hold off.
 
         Bounds after the horizon do not act, so that the plan would leave y_s with their part of
         y_s - r. The signals are `arranged`'s, and ``lam`` ``(*batch, n_g)`` the target's.

@@ -295,13 +295,13 @@ def _sizes(law: Law) -> dict[str, int]:
     (n, m, n_y, n_d), design, observer = law.design.plant.sizes, law.design, law.observer
     width = {key: place.stop - place.start for key, place in design.places.items()}
     stages, n_e, levels = design.horizon + 1, len(observer.F), law.mpc.plan.levels
-    of = {"N_R": "r", "N_UR": "u_r", "OFF": "off", "MOVES": "u_last"}
+    of = {"N_R": "r", "N_UR": "u_r", "OFF": "off", "MOVES": "u_last", "ENDS": "end"}
     of |= {"BOUNDED_Y": "y_s", "BOUNDED_U": "u_s"}
     sizes = {"N_X": n, "N_W": n_e - n, "N_E": n_e, "N_U": m, "N_Y": n_y, "N_D": n_d}
     sizes |= {"N_D_": max(n_d, 1), "GAINS": len(observer.gains), "STAGES": stages}
     sizes |= {"N_F": design.steady.anchors, "ROUNDS": ROUNDS}
     sizes |= {"SET_POINTS": stages if design.references == "preview" else 1}
-    sizes |= {"WEIGHTED": len(design.weighted), "PULLS": int(design.pulls[1].size > 0)}
+    sizes |= {"WEIGHTED": len(design.weighted)}
     sizes |= {"LEVELS": levels.values.shape[1] if levels else 0}
     sizes |= {"RUNS": max(levels.rules.sum(1)) if levels else 0}
     return sizes | {key: width[name] for key, name in of.items()}
@@ -318,7 +318,7 @@ def _tables(law: Law, dtype: str, missing: bool) -> dict[str, Array]:
     if missing:
         own |= {"S": S, "FIRST": first, "LS": LS, "LSL": LS @ observer.L.T}
         own |= {"OF_S": np.sqrt(np.diag(S)), "STEADY": np.array([STEADY])}
-    if design.pulls[1].size:  # the maps of `Design.weighed`
+    if design.pulls[1].size:  # the maps of `Design.end_set_points`
         (moved, shifts), tables = design.pulls, make_tables(law.mpc.targets)
         n_g = len(law.mpc.targets.quadratic_program().lb)
         shifts = np.pad(shifts, ((0, 0), (n_g - shifts.shape[1], 0)))[:, tables.places]

@@ -17,7 +17,6 @@ from torch_qpmpc.control.design import (
     Design,
     Target,
     read_prices,
-    read_said,
     read_switching,
     read_wishes,
     signals_of,
@@ -243,7 +242,6 @@ class LinearMPC:
             parts["plant"]["dynamics"] = LearnedModel(**dynamics)
         parts["plant"] = StateSpace(**parts["plant"])
         parts["disturbances"] = Disturbances(**parts["disturbances"])
-        parts["y_slack"] = read_said("y_slack", parts["y_slack"], parts["plant"].outputs)
         mpc = cls.of_design(Design(**parts), **options)
         if mpc.plan.learned:  # else theta is the design's
             mpc.plan.load_state_dict(content["mpc"])
@@ -298,7 +296,7 @@ class LinearMPC:
         values, stages = {"x": x, "known": known, "u_last": u_last}, [self.horizon + 1]
         values |= {f"target.{name}": part for name, part in target._asdict().items()}
         shapes = [[n], [*stages, n_d], [m]]
-        shapes += [[*stages * design.staged, size] for size in (n, m, n_y, n_y)]
+        shapes += [[*stages * design.staged, size] for size in (n, m, n_y, n_y, n_y)]
         x, known, u_last, *steady = _expanded(values, shapes, torch.as_tensor(x).shape[:-1])
         return design.arranged(torch, x, Target(*steady), u_last, known)
 

@@ -4,7 +4,7 @@ The plan's stages weigh y_k - r_k. Where bounds of inputs keep the target's outp
 cost of an endless loop about the target has a slope lam'(x - x_s), and so has the terminal cost,
 with lam = gamma A'lam + 2 C'Q (y_s - r): the plan rests at the target whatever its horizon (Zanon
 and Faulwasser, "Economic MPC without terminal constraints", J. Process Control 63, 2018). Of bounds
-of outputs see `Design.weighed`.
+of outputs see `Design.end_set_points`.
 
 The target is the steady state within bounds that is nearest to the set-point:
 
@@ -69,11 +69,11 @@ def lowered(design: Design) -> Scheme:
 
 
 def _model(design: Design) -> Model:
-    """Return the model of [x; u_last; y_s - r; y_s; u_s; 1], where all but x and u_last stay."""
+    """Return the model of the plan's state, where all but x and u_last stay."""
     s, plant = design.selectors(), design.plant
     n_d = design.places["known"].stop
     x = plant.A @ s["x"] + plant.B @ s["u"] + plant.E @ s["known"]
-    stay = (s[name] for name in ("off", "y_s", "u_s", "one"))
+    stay = (s[name] for name in ("off", "end", "y_s", "u_s", "one"))
     rows = np.vstack((x, s["u"][: len(s["u_last"])], *stay))
     n_x = n_d + len(rows)
     return Model(rows[:, n_d:n_x], rows[:, n_x:], rows[:, :n_d])
@@ -100,7 +100,8 @@ def _cost(design: Design, layout: Layout) -> Cost:
             linear[i] += price
     one, size = places["one"].start, places["u"].start
     stage[one, one] = 2 * SCALE * design.typical
-    P, end = riccati(design), off[:, :size]
+    P, end = riccati(design), s["end"]
+    end = (np.vstack((end, off - end)) if len(end) else off)[:, :size]
     x = np.vstack((s["x"], s["u_last"]))[:, :size]
     if P is None:
         terminal = _squares(y[:, :size], design.Q)
@@ -120,10 +121,11 @@ def _squares(T: Array, weight: Any) -> Array:
 def _slope(design: Design, P: Array) -> tuple[Array, Array]:
     """Return L and W with x'P x + 2 x'L off + off'W off >= 0, where L off is the target's slope.
 
-    ``off`` is y_s - r of the outputs with a weight. Modes at one, whose state inputs choose, take
-    the part of the slope that moves no input. The slope is that of held inputs; with one input,
-    which any slope of this sign keeps at its bound, that of the loop to r without bounds: far from
-    the target, where the input is free, the other would lead plans away from r.
+    ``off`` is y_s - r of the outputs with a weight, or with `Design.pulls` y_s - end, and end - r,
+    whose slope is the last stage's alone. Modes at one, whose state inputs choose, take the part of
+    the slope that moves no input. The slope is that of held inputs; with one input, which any slope
+    of this sign keeps at its bound, that of the loop to r without bounds: far from the target,
+    where the input is free, the other would lead plans away from r.
     """
     normal, (of_y, of_u, of_x, _), of_r = design.normal, design.scaling, design.weighted
     A, B, C = normal.plant.A, normal.plant.B, normal.plant.C
@@ -143,10 +145,15 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
         to_r = np.linalg.pinv(Y.T @ Q @ Y) @ Y.T @ Q * of_y[of_r]
         L = L - L @ (Y @ to_r / of_y[of_r, None])
         L = L + P @ (np.vstack(maps)[: len(P)] @ to_r / sizes[:, None])
+    size_r = of_y[of_r]
+    if design.pulls[1].size:
+        L, size_r = (
+            np.hstack((L, np.pad(right, ((0, len(L) - len(A)), (0, 0))))),
+            np.tile(size_r, 2),
+        )
     values, V = np.linalg.eigh(P)
     values, V = values[costly := values > TINY * values[-1]], V[:, costly]
-    own = V.T @ L / np.sqrt(values)[:, None]
-    size_r = of_y[of_r]  # and a slope without a cost would have no least value
+    own = V.T @ L / np.sqrt(values)[:, None]  # a slope without a cost would have no least value
     return V @ V.T @ L / np.outer(sizes, size_r), own.T @ own / np.outer(size_r, size_r)
 
 

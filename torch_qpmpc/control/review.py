@@ -379,7 +379,7 @@ def _offset(loop: LinearLoop, design: Design) -> Finding:
     off = np.abs(removable @ loop.offsets() * units) / design.scaling.y[:, None]
     parts = {"load": off[:, :m], "bias": off[:, m : m + n_y], "set-point": off[:, m + n_y :]}
     ok = bool(off.max(initial=0.0) < OFFSET)
-    left = ", ".join(f"{x.max(initial=0.0):.2g} of a {key}" for key, x in parts.items())
+    left = ", ".join(f"{x.max(initial=0.0).round(9):.2g} of a {key}" for key, x in parts.items())
     text = f"Offsets that inputs could remove, in half ranges of the outputs: {left}."
     remedy = "Take disturbances='auto': one for each output."
     return Finding("offset", ok, text, remedy * (not ok))

@@ -233,10 +233,10 @@ static int take(policy_state *s, const real r[])
     return 1;
 }
 
-/* Set the set-points that the plan weighs: r, but for what the outputs' bounds hold off. */
-static void weigh(policy_state *s, const real r[])
+#if POLICY_ENDS
+/* Set the set-points of the terminal cost: r, but for what the outputs' bounds hold off. */
+static void set_end(policy_state *s, const real r[])
 {
-#if POLICY_PULLS
     real off[N_Y], own[N_Y] = {0}, pull[N_Y], size = 0, share = 0;
     int i;
     for (i = 0; i < N_Y; i++) off[i] = s->y_s[i] - r[i];
@@ -251,11 +251,9 @@ static void weigh(policy_state *s, const real r[])
     }
     if (share > size) share = size;
     share = share > 0 ? share / size : 0;
-    for (i = 0; i < N_Y; i++) s->aims[i] = r[i] + own[i] - share * pull[i];
-#else
-    copy(s->aims, r, N_Y);
-#endif
+    for (i = 0; i < N_Y; i++) s->end[i] = r[i] + own[i] - share * pull[i];
 }
+#endif
 
 /* Set the target for the signals of a stage; return the code of its QPs. */
 static int aim(policy_state *s, const real r[], const real known[])
@@ -292,7 +290,9 @@ static int aim(policy_state *s, const real r[], const real known[])
     add(s->x_s, &X_L[0][0], N_X, LOADS, loads);
     add(s->u_s, &U_L[0][0], N_U, LOADS, loads);
     add(s->y_s, &Y_L[0][0], N_Y, LOADS, loads);
-    weigh(s, r);
+#if POLICY_ENDS
+    set_end(s, r);
+#endif
     return code;
 }
 
@@ -308,7 +308,7 @@ static int plan(policy_state *s, const real known[])
     for (k = N_R || N_UR ? 0 : LAST_ROW; k < STAGES; k++) {
         if (SET_POINTS > 1) r = s->r + k * N_Y;
         if ((code = aim(s, r, known + k * N_D)) != POLICY_SOLVED) return code;
-        for (i = 0; i < N_R; i++) p[k * N_K + i] = s->aims[OF_R[i]];
+        for (i = 0; i < N_R; i++) p[k * N_K + i] = r[OF_R[i]];
         copy(p + k * N_K + N_R, s->u_s, N_UR);
     }
     for (k = 0; k < STAGES; k++) {
@@ -318,7 +318,8 @@ static int plan(policy_state *s, const real known[])
     }
     for (i = 0; i < N_X; i++) *p++ = s->e[i] - s->x_s[i];
     for (i = 0; i < POLICY_MOVES; i++) *p++ = s->u[i] - s->u_s[i];
-    for (i = 0; i < POLICY_OFF; i++) *p++ = s->y_s[OF_R[i]] - s->aims[OF_R[i]];
+    for (i = 0; i < POLICY_OFF; i++) *p++ = s->y_s[OF_R[i]] - r[OF_R[i]];
+    for (i = 0; i < POLICY_ENDS; i++) *p++ = s->y_s[OF_R[i]] - s->end[OF_R[i]];
     for (i = 0; i < POLICY_BOUNDED_Y; i++) *p++ = s->y_s[OF_Y[i]];
     for (i = 0; i < POLICY_BOUNDED_U; i++) *p++ = s->u_s[OF_U[i]];
     *p = 1;

@@ -30,7 +30,7 @@ typedef struct {
     policy_real x_s[POLICY_N_X];                 /* the target: state, input and outputs */
     policy_real u_s[POLICY_N_U];
     policy_real y_s[POLICY_N_Y];
-    policy_real aims[POLICY_N_Y];               /* the set-points that the plan weighs */
+    policy_real end[POLICY_N_Y];                /* the set-points of the terminal cost */
     policy_real p[POLICY_PLAN_N_P];              /* what the plan's QP knows */
     policy_plan_state plan;
     policy_target_state target;
