@@ -18,7 +18,7 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_choice, check_kind, check_tensor, ungraded
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.files import load_file, reading, save_file
 from torch_qpmpc.identification.identification import measured_model, model_arguments
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc import parameters
@@ -519,15 +519,11 @@ class QPMPC(nn.Module):
             array([ True])
         """
         content = load_file(path, KIND)
-        try:
+        remedy = "Restore the file, or register the solver that it names."
+        with reading(path, "a file that QPMPC.save wrote", remedy):
             arguments = {x: y for x, y in content["arguments"].items() if x != "seed"}  # unused
             mpc = cls.of(**arguments)
             mpc.load_state_dict(content["mpc"])
-        except Exception as error:  # damaged files raise errors of any type
-            remedy = "Restore the file."
-            if str(error).startswith("solver: "):  # the file is right, this process is not
-                remedy = "Register the backend of that name first."
-            raise damaged(Path(path), error, "a file that QPMPC.save wrote", remedy) from error
         return mpc
 
     def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
