@@ -122,7 +122,6 @@ class QPQLearningLoss(LossModule):
         reduction: str | None = None,
         use_prioritized_weights: str | bool = "auto",
     ) -> None:
-        self._in_keys = None
         super().__init__()
         if gamma is not None:
             raise TypeError(_GAMMA_LMBDA_DEPREC_ERROR)
@@ -176,7 +175,6 @@ class QPQLearningLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         if self._value_estimator is not None:
             self._value_estimator.set_keys(**self._estimator_keys())
-        self._in_keys = None
 
     def _estimator_keys(self) -> dict[str, NestedKey]:
         names = ("advantage", "value_target", "value", "reward", "done", "terminated")
@@ -184,19 +182,12 @@ class QPQLearningLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        if self._in_keys is not None:
-            return self._in_keys
         names, observation = self.tensor_keys, self.state_value_network.in_keys
         following = (names.reward, names.done, names.terminated, *observation)
         keys = {*self.value_network.in_keys, *(unravel_key(("next", key)) for key in following)}
         if self.use_prioritized_weights is True:
             keys.add(unravel_key(names.priority_weight))
-        self._in_keys = sorted(keys, key=str)
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        return sorted(keys, key=str)
 
     def make_value_estimator(
         self, value_type: ValueEstimators | str | None = None, **hyperparams: Any
