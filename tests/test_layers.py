@@ -26,17 +26,17 @@ IMPORTS = {
 LAYERS = {name: {*allowed.split()} for name, allowed in IMPORTS.items()}
 #: The most lines of Python in each folder, as goals; `.` is the package's own files.
 BUDGET = {
-    ".": 294,
+    ".": 300,
     "analysis": 827,
-    "control": 4846,  # nonlinear plants, drifts as disturbances
+    "control": 4842,  # nonlinear plants, drifts as disturbances
     "envs": 1316,
-    "experiment": 2695,
-    "export": 1425,
+    "experiment": 2687,
+    "export": 1420,
     "learning": 2750,  # models that did not train theta decide in improve
     "identification": 2780,  # drifts keep steady gains right
-    "mpc": 3810,
+    "mpc": 3790,
     "proofs": 998,
-    "qp": 5234,
+    "qp": 5224,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,13 @@ def load_file(path: str | Path, kind: str, writer: str = "") -> dict[str, Any]:
     return content
 
 
-def damaged(file: Path, error: Exception, expected: str, remedy: str = RESTORE) -> QPError:
-    """Make the error of a ``file``, as of a run, that cannot be read."""
-    missing = f"it has no {error.args[0]}" if isinstance(error, KeyError) else ""
-    reason = missing or " ".join(str(error).split()) or type(error).__name__
-    return QPError.expected(file.name, f"{file} ({reason})", expected, remedy)
+@contextmanager
+def reading(file: str | Path, expected: str, remedy: str = RESTORE) -> Iterator[None]:
+    """Raise `QPError`, with the reason, if a block cannot read a ``file``."""
+    try:
+        yield
+    except Exception as error:  # damaged files raise errors of any type
+        missing = f"it has no {error.args[0]}" if isinstance(error, KeyError) else ""
+        reason = missing or " ".join(str(error).split()) or type(error).__name__
+        got = f"{file} ({reason})"
+        raise QPError.expected(Path(file).name, got, expected, remedy) from error

@@ -16,7 +16,6 @@ from tests.problems import normal, random_mpc, random_states
 from tests.refused import refused
 from torch_qpmpc import QPMPC, GaussNewton, QPError, SolverError
 from torch_qpmpc.mpc import projections as steps
-from torch_qpmpc.mpc.parameters import leaves
 from torch_qpmpc.mpc.projections import NEAREST, STEPS, nearest_psd, nearest_psd_by_sdp
 
 #: Dense blocks and the paper's diagonal, with learned ``w``.
@@ -56,7 +55,7 @@ def hessian_of(mpc: QPMPC, H: Any, H_f: Any) -> Any:
 def papers_step(mpc: QPMPC, rate: float) -> dict[str, Tensor]:
     """Solve eq:sdp1 for the parameters, given their gradients, entry by entry of theta."""
     root = mpc.discount.sqrt()
-    parameters = {name: leaves(mpc, name)[0] for name in mpc.learned}
+    parameters = {name: mpc.leaves(name)[0] for name in mpc.learned}
     step = {
         name: cp.Variable(p.shape, symmetric=p.ndim == 2 and name != "C")
         for name, p in parameters.items()
@@ -130,7 +129,7 @@ def test_non_finite_qps_go_to_the_solver(nearest):
 def test_the_gradient_of_a_matrix_is_symmetric():
     """Also for asymmetric losses, such as one entry of H or a function of the solution."""
     mpc = random_mpc(2, step="projection", **HESSIANS["block"])
-    (leaf,) = leaves(mpc, "H")
+    (leaf,) = mpc.leaves("H")
     (mpc.H[0, 1] + mpc.policy(random_states(3)).sum()).backward()
     assert leaf.grad is not None
     assert torch.equal(leaf.grad, leaf.grad.mT)

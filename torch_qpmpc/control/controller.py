@@ -16,13 +16,13 @@ from torch_qpmpc.control.explain import Explanation, explain
 from torch_qpmpc.control.exporting import ControllerExport, export_controller, export_controller_fmu
 from torch_qpmpc.control.law import Law, Memory, Outcome, Signals
 from torch_qpmpc.control.learning import LearningReport, improve, learn
-from torch_qpmpc.control.linear_mpc import LinearMPC, packed, restored, unpacked
+from torch_qpmpc.control.linear_mpc import SAVED, LinearMPC, packed, unpacked
 from torch_qpmpc.control.observer import Observer
 from torch_qpmpc.control.review import Review, review
 from torch_qpmpc.control.simulation import Run, ready, simulate
 from torch_qpmpc.control.state_space import Array, by_name, read_table
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import load_file, save_file
+from torch_qpmpc.files import load_file, reading, save_file
 from torch_qpmpc.learning.closed_loop import Improvement
 
 #: The kind of file that `Controller.save` writes.
@@ -245,7 +245,9 @@ class Controller:
             QPError: the file is missing or damaged, of another kind or release, or holds more than
                 tensors and plain values.
         """
-        return restored(path, load_file(path, KIND), cls._of_stored)
+        content = load_file(path, KIND)
+        with reading(path, *SAVED):
+            return cls._of_stored(content)
 
     @classmethod
     def _of_stored(cls, content: Mapping[str, Any]) -> Controller:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from inspect import signature
 from pathlib import Path
@@ -25,7 +25,7 @@ from torch_qpmpc.control.disturbance import Disturbances, choose
 from torch_qpmpc.control.lowering import aimed, lowered, target_mpc
 from torch_qpmpc.control.state_space import StateSpace, read_model
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.files import load_file, reading, save_file
 from torch_qpmpc.identification.learned import LearnedModel
 from torch_qpmpc.mpc.layout import read_blocks
 from torch_qpmpc.mpc.module import QPMPC
@@ -34,6 +34,8 @@ from torch_qpmpc.mpc.state import KIND, check_own, stored
 
 #: The options of a plan's `QPMPC`.
 OPTIONS = {"structure": "tied", "learn": (), "solver": "daqp"}
+#: What the files that `save` writes are, and what to do about a damaged one.
+SAVED = "a file that save wrote", "Restore it."
 
 
 class LinearMPC:
@@ -222,7 +224,8 @@ class LinearMPC:
         if "design" not in content:
             remedy = "QPMPC.load reads it."
             raise QPError.expected("path", f"{path}, a QPMPC", "a saved LinearMPC", remedy)
-        return restored(path, content, cls.of_stored)
+        with reading(path, *SAVED):
+            return cls.of_stored(content)
 
     def stored(self) -> dict[str, Any]:
         """Return the content of a file, tensors and plain values, that `of_stored` reads.
@@ -314,14 +317,6 @@ def _expanded(
             want = f"{shape[-1]} entries, and batch dimensions as those of the others"
             raise QPError.expected(name, f"shape {tuple(part.shape)}", want) from error
     return expanded
-
-
-def restored(path: str | Path, content: Mapping[str, Any], of: Callable[[Any], Any]) -> Any:
-    """Return what ``of`` makes of a file's content; raise `QPError` if it is damaged."""
-    try:
-        return of(content)
-    except Exception as error:  # damaged files raise errors of any type
-        raise damaged(Path(path), error, "a file that save wrote", "Restore it.") from error
 
 
 def packed(value: Any) -> Any:

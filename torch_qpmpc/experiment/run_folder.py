@@ -16,7 +16,7 @@ from torchrl.record.loggers import TensorboardLogger
 
 from torch_qpmpc.errors import QPError
 from torch_qpmpc.experiment.config import Config, flatten
-from torch_qpmpc.files import damaged, write_whole
+from torch_qpmpc.files import reading, write_whole
 
 #: The newest state of a run in its folder.
 CHECKPOINT = "checkpoint.pt"
@@ -84,29 +84,25 @@ class RunFolder(AbstractContextManager["RunFolder"]):
 def read_config(folder: str | Path) -> Config:
     """Read a run's config.yaml; `QPError` if it is damaged or of another version."""
     file = Path(folder) / "config.yaml"
-    try:
+    with reading(file, "the configuration that a run of this version wrote"):
         tree: Any = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
         if not isinstance(tree, dict):
             raise ValueError("it is a list")
         if key := next((key for key, x in flatten(tree).items() if "${" in str(x)), None):
             raise ValueError(f"{key} is an interpolation: write its value")
         return Config.of(tree)
-    except Exception as error:  # damaged files raise errors of any type
-        raise damaged(file, error, "the configuration that a run of this version wrote") from error
 
 
 def read_metrics(folder: str | Path) -> pd.DataFrame:
     """Read a run's metrics.csv by update, to the last digit."""
     file = Path(folder) / "metrics.csv"
-    try:
+    remedy = "Go on in a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
+    with reading(file, "the table that a run wrote", remedy):
         text = file.read_text(encoding="utf-8")
         if not text.endswith("\n"):
             raise ValueError("its last line is cut off")
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip").astype(float)
         return table.astype({"update": int}).set_index("update")
-    except (OSError, ValueError, KeyError) as error:
-        remedy = "Go on in a copy of the folder, or start a new run with hydra.run.dir=FOLDER."
-        raise damaged(file, error, "the table that a run wrote", remedy) from error
 
 
 def read_summary(folder: str | Path) -> dict[str, Any]:
@@ -115,14 +111,12 @@ def read_summary(folder: str | Path) -> dict[str, Any]:
     if file.with_name(CHECKPOINT).exists() and not file.exists():
         remedy = f"Finish it: repeat its command with hydra.run.dir={folder}."
         raise QPError.expected("folder", f"{folder}, with a stopped run", "a finished run", remedy)
-    try:
+    with reading(file, "the outcome that a run wrote"):
         summary = json.loads(file.read_text(encoding="utf-8"))
         for name in NUMBERS:
             if not isinstance(summary[name], int | float | None):
                 raise ValueError(f"{name} is {summary[name]!r}")
         return summary
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise damaged(file, error, "the outcome that a run wrote") from error
 
 
 def not_null(value: Any) -> Any:

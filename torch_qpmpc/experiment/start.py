@@ -17,7 +17,7 @@ from torch_qpmpc.experiment.config import Config
 from torch_qpmpc.experiment.logs import estimated, without_blow_ups
 from torch_qpmpc.experiment.tasks import AnyPlant
 from torch_qpmpc.experiment.tasks.identified import Start, identified_start
-from torch_qpmpc.files import damaged, load_file, read_tensors, save_file, write_whole
+from torch_qpmpc.files import load_file, read_tensors, reading, save_file, write_whole
 from torch_qpmpc.identification.innovations import Innovations
 from torch_qpmpc.learning.replay import Replay
 
@@ -124,10 +124,8 @@ def read_observer(folder: str | Path) -> Innovations | None:
     if not path.exists():
         return None
     content = load_file(path, "observer", "train.py")
-    try:
+    with reading(path, "the observer that a run wrote"):
         return Innovations(*(content[name].numpy() for name in Innovations._fields))
-    except Exception as error:  # damaged files raise errors of any type
-        raise damaged(path, error, "the observer that a run wrote") from error
 
 
 def stored_log(path: str | Path, name: str = LOG, remedy: str = "") -> TensorDict:

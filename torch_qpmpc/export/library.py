@@ -24,24 +24,19 @@ FLAGS = ("-std=c99", "-O3", "-fPIC", "-shared")
 
 def compiler() -> list[str] | None:
     """Return the command of $CC, cc, gcc, clang or ziglang, the first that exists, else None."""
-    if named := _named():
-        return named if shutil.which(named[0]) else None
+    command = os.environ.get("CC", "")
+    try:
+        if named := shlex.split(command):
+            return named if shutil.which(named[0]) else None
+    except ValueError as error:
+        got = f"{command!r}: {error}"
+        raise QPError.expected("$CC", got, "a command", "Correct or unset it.") from error
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
             return [path]
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
     return None
-
-
-def _named() -> list[str]:
-    """Return the words of $CC, such as ``ccache gcc -m32``."""
-    command = os.environ.get("CC", "")
-    try:
-        return shlex.split(command)
-    except ValueError as error:
-        got = f"{command!r}: {error}"
-        raise QPError.expected("$CC", got, "a command", "Correct or unset it.") from error
 
 
 def required_compiler() -> list[str]:
@@ -52,8 +47,8 @@ def required_compiler() -> list[str]:
     """
     if (command := compiler()) is None:
         got, remedy = "none on the PATH", "Install one, or pip install ziglang, which has clang."
-        if named := _named():
-            remedy += f" $CC is {' '.join(named)!r}; {named[0]!r} does not exist: unset it."
+        if named := os.environ.get("CC"):
+            remedy += f" $CC is {named!r}; {named.split()[0]!r} does not exist: unset it."
         raise QPError.expected("compiler", got, "a C compiler: $CC, cc, gcc or clang", remedy)
     return command
 

@@ -18,14 +18,14 @@ from torch.nn.utils import parametrize
 
 from torch_qpmpc.checks import check_choice, check_kind, check_tensor, ungraded
 from torch_qpmpc.errors import QPError
-from torch_qpmpc.files import damaged, load_file, save_file
+from torch_qpmpc.files import load_file, reading, save_file
 from torch_qpmpc.identification.identification import measured_model, model_arguments
 from torch_qpmpc.identification.learned import LearnedModel
-from torch_qpmpc.mpc import parameters
 from torch_qpmpc.mpc.layout import Layout
 from torch_qpmpc.mpc.levels import Levels
 from torch_qpmpc.mpc.model import Model
 from torch_qpmpc.mpc.nonlinear import PlanSolution, SequentialQP, linearised
+from torch_qpmpc.mpc.parameters import Leaves, Theta, for_each
 from torch_qpmpc.mpc.parametrizations import (
     SIGNED,
     Banded,
@@ -59,7 +59,7 @@ from torch_qpmpc.qp.tracing import full_precision, is_differentiating, is_eager
 LEARN = ("H", "c", "C")
 
 
-class QPMPC(nn.Module):
+class QPMPC(Theta):
     """A parametric QP (eq:qp5) that starts from a `Scheme`.
 
     `from_model` makes one from a model, `from_data` from a log, `of` from a scheme's arguments.
@@ -189,7 +189,7 @@ class QPMPC(nn.Module):
         for name, start in theta.items():
             if name in self.learned:
                 own = self._parametrizations_for(name, start)
-                parameters.attach(self, name, start.clone(), own)
+                self._attach(name, start.clone(), own)
             else:
                 self.register_buffer(name, start.clone())
 
@@ -411,10 +411,6 @@ class QPMPC(nn.Module):
             raise QPError.expected("structure", "'free'", "'tied', which has a model")
         return Banded(self.layout).right_inverse(self.C)
 
-    def readable(self) -> dict[str, Tensor]:
-        """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
-        return parameters.readable(self)
-
     def release(self) -> None:
         """Remove the ties of a linear MPC scheme in place, without a change of values.
 
@@ -424,7 +420,7 @@ class QPMPC(nn.Module):
         for part in self.learned:
             if parametrize.is_parametrized(self, part) and part not in ("H", "H_f"):
                 value = getattr(self, part).detach()
-                parameters.replace(self, part, self._parametrizations_for(part, value))
+                self._replace(part, self._parametrizations_for(part, value))
         # In the order of a module that is made free, as optimisers load their state by it.
         for part in [x for x in self.scheme.theta if x in self._parameters]:
             self._parameters[part] = self._parameters.pop(part)
@@ -454,7 +450,7 @@ class QPMPC(nn.Module):
         """
         with full_precision(self.C_0):
             if residuals is not None:
-                theta = parameters.moved(self, residuals)
+                theta = self._moved(residuals)
             else:
                 theta = {part: getattr(self, part) for part in (*COST, *CONSTRAINTS)}
             hessian = partial(make_hessian, self.layout, self.hessian, discount=self.discount)
@@ -462,7 +458,7 @@ class QPMPC(nn.Module):
             if residuals is None:
                 H = hessian(*weights)
             else:
-                H = parameters.for_each(hessian, weights, self._block_ndims)
+                H = for_each(hessian, weights, self._block_ndims)
             q = self.discount * theta["q"]
             # A hard row's w is a placeholder, to which its hardness adds inf.
             w = torch.addcmul(self.hardness, self.slack_discount, theta["w"])
@@ -477,14 +473,6 @@ class QPMPC(nn.Module):
                     again = again & torch.cat(same, -1)
                 lb, ub = lb.masked_fill(again, -torch.inf), ub.masked_fill(again, torch.inf)
             return QuadraticProgram(H, q, c, C, b, G, lb, ub, w, check_values=False)
-
-    def coordinates(self) -> dict[str, Tensor]:
-        """Return the unconstrained coordinates of theta, which residuals move, by name.
-
-        They are the parts themselves or, behind learned parts, factors of H, H_f and w, the shorter
-        vectors of tied parts, and A, B, E and D, D_f of a tied C and G.
-        """
-        return parameters.coordinates(self)
 
     def save(self, path: str | Path) -> None:
         """Write this QPMPC atomically to a file of tensors and plain values, which runs no code.
@@ -519,39 +507,12 @@ class QPMPC(nn.Module):
             array([ True])
         """
         content = load_file(path, KIND)
-        try:
+        remedy = "Restore the file, or register the solver that it names."
+        with reading(path, "a file that QPMPC.save wrote", remedy):
             arguments = {x: y for x, y in content["arguments"].items() if x != "seed"}  # unused
             mpc = cls.of(**arguments)
             mpc.load_state_dict(content["mpc"])
-        except Exception as error:  # damaged files raise errors of any type
-            remedy = "Restore the file."
-            if str(error).startswith("solver: "):  # the file is right, this process is not
-                remedy = "Register the backend of that name first."
-            raise damaged(Path(path), error, "a file that QPMPC.save wrote", remedy) from error
         return mpc
-
-    def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Return parameter groups for an optimiser, one for each learned part of theta.
-
-        Args:
-            rates: learning rates by part (``"H"``, ..), for others by family, ``"cost"`` (H, H_f,
-                q, c, w) and ``"constraints"`` (C, b, G, lb, ub), and of a module of ``"dynamics"``.
-
-        Raises:
-            QPError: a learned part has no rate, or a name or a rate is invalid.
-        """
-        return parameters.groups(self, rates)
-
-    def leaves(self, part: str) -> list[nn.Parameter]:
-        """Return the parameters of the learned ``part``, such as the factor of ``"H"``.
-
-        Raises:
-            QPError: ``part`` is not learned.
-        """
-        if part not in self.learned:
-            expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
-            raise QPError.expected("part", repr(part), expected)
-        return parameters.leaves(self, part)
 
     def reset_parameters(self) -> None:
         """Reset theta to its initial values."""
@@ -668,7 +629,7 @@ class QPMPC(nn.Module):
             return None
         leaves, at_rest = vars(self).get("_at_rest", (None, None))
         if leaves is None or not leaves.unchanged(self) or at_rest.solver != self.solver:
-            leaves, at_rest = parameters.Leaves(self), self.at_rest()
+            leaves, at_rest = Leaves(self), self.at_rest()
             vars(self)["_at_rest"] = leaves, at_rest
         if not leaves.known:
             return None
@@ -693,4 +654,4 @@ class QPMPC(nn.Module):
     def _projected(self) -> dict[str, nn.Parameter]:
         """Return the parameters that `project_` projects, by part."""
         names = () if self.step == CHOLESKY else SIGNED
-        return {name: parameters.leaves(self, name)[0] for name in names if name in self.learned}
+        return {name: self.leaves(name)[0] for name in names if name in self.learned}

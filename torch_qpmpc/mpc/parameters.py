@@ -32,30 +32,6 @@ LARGE = 2**14
 MODELS: dict[type, tuple[str, ...]] = {Banded: ("A", "B", "E"), LinearRows: ("D", "D_f")}
 
 
-def attach(module: nn.Module, name: str, value: Tensor, parametrizations: list[nn.Module]) -> None:
-    """Register a learned part with its value and parametrizations."""
-    module.register_parameter(name, nn.Parameter(value))
-    for parametrization in parametrizations:
-        parametrize.register_parametrization(module, name, parametrization)
-    if len(parametrizations) > 1:  # each but the first has changed the value
-        setattr(module, name, value)
-
-
-def replace(module: nn.Module, name: str, parametrizations: list[nn.Module]) -> None:
-    """Replace the parametrizations of a part; its value and its ``requires_grad`` stay."""
-    value = getattr(module, name).detach().clone()
-    # torch makes a class per module, which its deep copies share; remove_parametrizations deletes
-    # the part's property from it, and would break the copies.
-    own = type(type(module).__name__, type(module).__bases__, {**vars(type(module))})
-    module.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - equal but for its identity
-    frozen = not any(leaf.requires_grad for leaf in leaves(module, name))
-    parametrize.remove_parametrizations(module, name)
-    delattr(module, name)
-    attach(module, name, value, parametrizations)
-    for leaf in leaves(module, name):
-        leaf.requires_grad_(not frozen)
-
-
 def chain(module: nn.Module, name: str) -> list[nn.Module]:
     """Return the parametrizations of a part, in order; none if it is plain."""
     if not parametrize.is_parametrized(module, name):
@@ -63,75 +39,147 @@ def chain(module: nn.Module, name: str) -> list[nn.Module]:
     return [*module.get_submodule(f"parametrizations.{name}").children()]
 
 
-def leaves(module: nn.Module, name: str) -> list[nn.Parameter]:
-    """Return the parameters of a learned part, such as the factor of H."""
-    if not parametrize.is_parametrized(module, name):
-        return [module.get_parameter(name)]
-    return list(module.get_submodule(f"parametrizations.{name}").parameters(recurse=False))
+class Theta(nn.Module):
+    """A module that holds the parts of theta, some of them ``learned``."""
+
+    learned: tuple[str, ...]
+    sequential: Any
+
+    def _attach(self, name: str, value: Tensor, parametrizations: list[nn.Module]) -> None:
+        """Register a learned part with its value and parametrizations."""
+        self.register_parameter(name, nn.Parameter(value))
+        for parametrization in parametrizations:
+            parametrize.register_parametrization(self, name, parametrization)
+        if len(parametrizations) > 1:  # each but the first has changed the value
+            setattr(self, name, value)
+
+    def _replace(self, name: str, parametrizations: list[nn.Module]) -> None:
+        """Replace the parametrizations of a part; its value and its ``requires_grad`` stay."""
+        value = getattr(self, name).detach().clone()
+        # torch makes a class per module, which its deep copies share; remove_parametrizations
+        # deletes the part's property from it, and would break the copies.
+        own = type(type(self).__name__, type(self).__bases__, {**vars(type(self))})
+        self.__class__ = own  # pyright: ignore[reportAttributeAccessIssue] - equal but for its identity
+        frozen = not any(leaf.requires_grad for leaf in self.leaves(name))
+        parametrize.remove_parametrizations(self, name)
+        delattr(self, name)
+        self._attach(name, value, parametrizations)
+        for leaf in self.leaves(name):
+            leaf.requires_grad_(not frozen)
+
+    def leaves(self, part: str) -> list[nn.Parameter]:
+        """Return the parameters of the learned ``part``, such as the factor of ``"H"``.
+
+        Raises:
+            QPError: ``part`` is not learned.
+        """
+        if part not in self.learned:
+            expected = f"one of the learned parts: {', '.join(self.learned) or 'none'}"
+            raise QPError.expected("part", repr(part), expected)
+        if not parametrize.is_parametrized(self, part):
+            return [self.get_parameter(part)]
+        return list(self.get_submodule(f"parametrizations.{part}").parameters(recurse=False))
+
+    def readable(self) -> dict[str, Tensor]:
+        """Return the learned parts, detached: A, B, E and D for C and G, shared values once."""
+        values = {}
+        for part in self.learned:
+            value = getattr(self, part).detach()
+            first = next(iter(chain(self, part)), None)
+            if isinstance(first, Banded | LinearRows):
+                values |= dict(zip(MODELS[type(first)], first.right_inverse(value), strict=False))
+            else:
+                values[part] = value[first.first] if isinstance(first, Tied) else value
+        return values
+
+    def parameter_groups(self, rates: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Return parameter groups for an optimiser, one for each learned part of theta.
+
+        Args:
+            rates: learning rates by part (``"H"``, ..), for others by family, ``"cost"`` (H, H_f,
+                q, c, w) and ``"constraints"`` (C, b, G, lb, ub), and of a module of ``"dynamics"``.
+
+        Raises:
+            QPError: a learned part has no rate, or a name or a rate is invalid.
+        """
+        check_kind("rates", rates, Mapping, "Map names: {'cost': .., 'constraints': ..}.")
+        known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
+        if unknown := set(rates) - known:
+            raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
+        learned, dynamics = self.learned, [*getattr(self.sequential, "parameters", list)()]
+        if unused := set(rates) - {*learned, "cost", "constraints", *["dynamics"] * bool(dynamics)}:
+            expected = (
+                f"parts that are learned: {', '.join(learned) or 'none'}, or a dynamics module"
+            )
+            raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
+        result = []
+        for part in (*learned, *["dynamics"] * ("dynamics" in rates)):
+            rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
+            if rate is None:
+                want = "a rate for every learned part, or its family"
+                raise QPError.expected("rates", f"nothing for {part}", want)
+            check_number(f"rates[{part}]", rate, *NONNEGATIVE)
+            own = dynamics if part == "dynamics" else self.leaves(part)
+            result.append({"params": own, "lr": rate, "name": part})
+        return result
+
+    def coordinates(self) -> dict[str, Tensor]:
+        """Return the unconstrained coordinates of theta, which residuals move, by name.
+
+        They are the parts themselves or, behind learned parts, factors of H, H_f and w, the shorter
+        vectors of tied parts, and A, B, E and D, D_f of a tied C and G.
+        """
+        parts = (self._coordinates_of(part) for part in (*COST, *CONSTRAINTS))
+        return {name: x for part in parts for name, x in part.items()}
+
+    def _moved(self, residuals: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the parts of theta with ``residuals`` ``(*batch, ..)`` added to coordinates."""
+        check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
+        rest = dict(residuals)
+        theta = {}
+        for part in (*COST, *CONSTRAINTS):
+            before = self._coordinates_of(part)
+            own = {name: rest.pop(name) for name in before if name in rest}
+            for name, residual in own.items():
+                start = before[name]
+                check_tensor(f"residuals[{name!r}]", residual, *start.shape, device=start.device)
+            theta[part] = self._with_residuals(part, before, own) if own else getattr(self, part)
+        check_names("residuals", rest, self)
+        return theta
+
+    def _coordinates_of(self, part: str) -> dict[str, Tensor]:
+        """Return those of a part; H, H_f and w have some only if they are learned."""
+        if part in ("C", "b") and self.sequential is not None:
+            return {}  # the dynamics take their place
+        if not parametrize.is_parametrized(self, part):
+            learned = part in self._parameters
+            return {} if part in SIGNED and not learned else {part: getattr(self, part)}
+        own: Any = self.get_submodule(f"parametrizations.{part}")
+        names = MODELS.get(type(next(iter(own.children()))), (part,))
+        # By attribute, as a functional call replaces parameters with plain tensors.
+        if hasattr(own, "original"):
+            return {names[0]: own.original}
+        originals = (getattr(own, f"original{i}", None) for i in range(len(names)))
+        return {name: x for name, x in zip(names, originals, strict=True) if x is not None}
+
+    def _with_residuals(
+        self, part: str, before: dict[str, Tensor], residuals: dict[str, Tensor]
+    ) -> Tensor:
+        after = [
+            x + residuals[name].to(x.dtype) if name in residuals else x
+            for name, x in before.items()
+        ]
+        value, own = after[0], chain(self, part)
+        if own and isinstance(own[0], Banded | LinearRows):
+            value = for_each(own.pop(0), after, [x.ndim for x in before.values()])
+        for parametrization in own:
+            value = parametrization(value)
+        return value
 
 
-def readable(module: Any) -> dict[str, Tensor]:
-    """Return the learned parts, detached: A, B, E and D for C and G, and shared values once."""
-    values = {}
-    for part in module.learned:
-        value = getattr(module, part).detach()
-        first = next(iter(chain(module, part)), None)
-        if isinstance(first, Banded | LinearRows):
-            values |= dict(zip(MODELS[type(first)], first.right_inverse(value), strict=False))
-        else:
-            values[part] = value[first.first] if isinstance(first, Tied) else value
-    return values
-
-
-def groups(module: Any, rates: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Return `QPMPC.parameter_groups`."""
-    check_kind("rates", rates, Mapping, "Map names: {'cost': .., 'constraints': ..}.")
-    known = {*COST, *CONSTRAINTS, "cost", "constraints", "dynamics"}
-    if unknown := set(rates) - known:
-        raise QPError.expected("rates", sorted(unknown), f"names among {sorted(known)}")
-    learned, dynamics = module.learned, [*getattr(module.sequential, "parameters", list)()]
-    if unused := set(rates) - {*learned, "cost", "constraints", *["dynamics"] * bool(dynamics)}:
-        expected = f"parts that are learned: {', '.join(learned) or 'none'}, or a dynamics module"
-        raise QPError.expected("rates", sorted(unused), expected, "Add them to learn.")
-    result = []
-    for part in (*learned, *["dynamics"] * ("dynamics" in rates)):
-        rate = rates.get(part, rates.get("cost" if part in COST else "constraints"))
-        if rate is None:
-            want = "a rate for every learned part, or its family"
-            raise QPError.expected("rates", f"nothing for {part}", want)
-        check_number(f"rates[{part}]", rate, *NONNEGATIVE)
-        own = dynamics if part == "dynamics" else leaves(module, part)
-        result.append({"params": own, "lr": rate, "name": part})
-    return result
-
-
-def coordinates(module: nn.Module) -> dict[str, Tensor]:
-    """Return `QPMPC.coordinates`; H, H_f and w have some only if they are learned."""
-    named: dict[str, Tensor] = {}
-    for part in (*COST, *CONSTRAINTS):
-        named |= _of_part(module, part)
-    return named
-
-
-def moved(module: nn.Module, residuals: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the parts of theta with ``residuals`` ``(*batch, ..)`` added to its coordinates."""
-    check_kind("residuals", residuals, Mapping, "Map names to tensors: {'q': ..}.")
-    rest = dict(residuals)
-    theta = {}
-    for part in (*COST, *CONSTRAINTS):
-        before = _of_part(module, part)
-        own = {name: rest.pop(name) for name in before if name in rest}
-        for name, residual in own.items():
-            start = before[name]
-            check_tensor(f"residuals[{name!r}]", residual, *start.shape, device=start.device)
-        theta[part] = _with_residuals(module, part, before, own) if own else getattr(module, part)
-    check_names("residuals", rest, module)
-    return theta
-
-
-def check_names(argument: str, names: Collection[str], module: nn.Module) -> None:
+def check_names(argument: str, names: Collection[str], module: Theta) -> None:
     """Raise `QPError` if one of the ``names`` in an argument is not a coordinate's."""
-    known = coordinates(module)
+    known = module.coordinates()
     if unknown := [name for name in names if name not in known]:
         unlearned = [name for name in unknown if name in SIGNED and hasattr(module, name)]
         remedy = f"Add {unlearned[0]} to learn." if unlearned else ""
@@ -204,32 +252,3 @@ def for_each(
         for x, lead in zip(operands, leads, strict=True)
     ]
     return torch.vmap(function)(*flat).unflatten(0, batch)
-
-
-def _of_part(module: nn.Module, part: str) -> dict[str, Tensor]:
-    if part in ("C", "b") and module.sequential is not None:
-        return {}  # the dynamics take their place
-    if not parametrize.is_parametrized(module, part):
-        learned = part in module._parameters
-        return {} if part in SIGNED and not learned else {part: getattr(module, part)}
-    own: Any = module.get_submodule(f"parametrizations.{part}")
-    names = MODELS.get(type(next(iter(own.children()))), (part,))
-    # By attribute, as a functional call replaces parameters with plain tensors.
-    if hasattr(own, "original"):
-        return {names[0]: own.original}
-    originals = (getattr(own, f"original{i}", None) for i in range(len(names)))
-    return {name: x for name, x in zip(names, originals, strict=True) if x is not None}
-
-
-def _with_residuals(
-    module: nn.Module, part: str, before: dict[str, Tensor], residuals: dict[str, Tensor]
-) -> Tensor:
-    after = [
-        x + residuals[name].to(x.dtype) if name in residuals else x for name, x in before.items()
-    ]
-    value, own = after[0], chain(module, part)
-    if own and isinstance(own[0], Banded | LinearRows):
-        value = for_each(own.pop(0), after, [x.ndim for x in before.values()])
-    for parametrization in own:
-        value = parametrization(value)
-    return value
