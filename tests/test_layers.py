@@ -30,8 +30,8 @@ BUDGET = {
     "analysis": 827,
     "control": 4840,  # nonlinear plants, drifts as disturbances
     "envs": 1316,
-    "experiment": 2695,
-    "export": 1425,
+    "experiment": 2682,
+    "export": 1406,
     "learning": 2750,  # models that did not train theta decide in improve
     "identification": 2780,  # drifts keep steady gains right
     "mpc": 3810,
