@@ -33,7 +33,7 @@ BUDGET = {
     "experiment": 2682,
     "export": 1406,
     "learning": 2750,  # models that did not train theta decide in improve
-    "identification": 2780,  # drifts keep steady gains right
+    "identification": 2802,  # one decimal mark for a file; drifts keep steady gains right
     "mpc": 3810,
     "proofs": 998,
     "qp": 5234,
