@@ -100,7 +100,7 @@ TWICE = "column: got 'T', which is there twice, expected one of T, q, T_out"
         (["\ufeff", HEADER.replace(",", " , "), "", *ROWS], [59]),
         ([HEADER, *ROWS[:20], HEADER, *ROWS[20:]], [19, 39]),
         ([HEADER.replace("q", "q1"), *ROWS[:20], HEADER.replace("q", "q1"), *ROWS[20:]], [19, 39]),
-        ([HEADER, *(f"{row},1" for row in ROWS)], "Length of header"),
+        ([HEADER, *(f"{row},1" for row in ROWS)], "expected .* begins with a name for each field"),
         ([HEADER, ROWS[0], *(f"{row},1" for row in ROWS)], "Expected 3 fields in line 3, saw 4"),
         ([f"{HEADER},T", *(f"{row},1" for row in ROWS)], TWICE),
         ([], "which cannot be read"),

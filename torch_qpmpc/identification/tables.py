@@ -114,8 +114,8 @@ def _frame(part: Any) -> pd.DataFrame:
         try:
             return _read_csv(Path(part))
         except (OSError, ValueError, Warning) as error:
-            got = f"{part}, which cannot be read ({error})"
-            raise QPError.expected("data", got, "a CSV file that begins with a header") from error
+            got, want = f"{part}, which cannot be read ({error})", "a CSV file that begins with"
+            raise QPError.expected("data", got, f"{want} a name for each field") from error
     if isinstance(part, pd.DataFrame):
         if isinstance(part.index, pd.MultiIndex):
             remedy = "Call reset_index(), and name its columns by time= and episode=."
