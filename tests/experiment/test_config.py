@@ -103,7 +103,8 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("solver", "cplex", "got 'cplex', expected one of proxqp, daqp"),
     ("constraint.learn", ["C", "H"], "got 'H', but input should be 'C', 'b', 'G', 'lb' or 'ub'."),
     ("constraint.si", 3, "got 3, but input should be a valid dictionary"),
-    ("optimizer.name", "rmsprop", "got 'rmsprop', but input tag 'rmsprop' found using 'name' does"),
+    ("optimizer.name", "rmsprop", "got 'rmsprop', but input should be 'adam', 'sgd', 'gauss"),
+    ("rivals", "none", "got 'none', but input should be a valid boolean or a valid list."),
     ("optimizer.betas", [0.9], "got [0.9], but list should have at least 2 items after validation"),
     ("task", 3, "got 3, expected its keys, as in configs/task/."),
     ("task.name", "unknown", "got 'unknown', expected one of "),
@@ -134,7 +135,7 @@ def test_missing_keys(key):
     owner, _, leaf = key.rpartition(".")
     OmegaConf.set_struct(cfg, False)
     del (OmegaConf.select(cfg, owner) if owner else cfg)[leaf]
-    with pytest.raises(QPError, match=rf"^{re.escape(key)}: got nothing, but "):
+    with pytest.raises(QPError, match=rf"^{re.escape(key)}: got nothing, but field required.$"):
         Config.of(cfg)
     cfg["update"] = 3
     with pytest.raises(QPError, match=r"^update: got an unknown"):

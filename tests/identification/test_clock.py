@@ -197,3 +197,7 @@ def test_many_gaps_are_said():
     t = 0.25 * np.arange(600) + 3.0 * (np.arange(600) // 30)
     with pytest.warns(UserWarning, match=r"^The times have 19 gaps between steps of 0.25, at each"):
         qm.read_log(room(600).assign(t=t), **NAMES, time="t")
+    dated = room().assign(t=pd.date_range("2026-03-01", periods=60, freq="min"))
+    swapped = dated.iloc[np.arange(60).reshape(-1, 6)[:, [0, 1, 2, 4, 3, 5]].ravel()]
+    with pytest.warns(UserWarning, match=r"\? 10 of them go back in time: sort the rows.$"):
+        qm.read_log(swapped, **NAMES, time="t")

@@ -100,7 +100,7 @@ TWICE = "column: got 'T', which is there twice, expected one of T, q, T_out"
         (["\ufeff", HEADER.replace(",", " , "), "", *ROWS], [59]),
         ([HEADER, *ROWS[:20], HEADER, *ROWS[20:]], [19, 39]),
         ([HEADER.replace("q", "q1"), *ROWS[:20], HEADER.replace("q", "q1"), *ROWS[20:]], [19, 39]),
-        ([HEADER, *(f"{row},1" for row in ROWS)], "Length of header"),
+        ([HEADER, *(f"{row},1" for row in ROWS)], "expected .* begins with a name for each field"),
         ([HEADER, ROWS[0], *(f"{row},1" for row in ROWS)], "Expected 3 fields in line 3, saw 4"),
         ([f"{HEADER},T", *(f"{row},1" for row in ROWS)], TWICE),
         ([], "which cannot be read"),
@@ -126,6 +126,7 @@ def test_a_file_is_read_by_its_header(tmp_path, lines, steps):
         (";", ",", "utf-8"),
         (";", ",", "cp1252"),
         (";", ".", "utf-8-sig"),
+        ("|", ".", "utf-8"),
         ("\t", ",", "utf-8"),
         ("\t", ",", "utf-16"),
     ],
@@ -138,6 +139,51 @@ def test_a_file_of_another_country_is_read(tmp_path, sep, decimal, encoding):
     assert same(log, qm.read_log(frame, **NAMES, time="t"))
     assert (log.units, log.dt, log.dt_unit) == ({"T": "°C"}, 0.25, "h")
     assert str(log).startswith("59 steps, one step every 0.25 h: outputs T [°C]; inputs q;")
+
+
+@pytest.mark.parametrize(
+    ("sep", "decimal", "thousands", "remedy"),
+    [
+        (";", ",", ".", "decimal=.., thousands=.."),
+        ("\t", ".", ",", "decimal=.., thousands=.."),
+        (";", ",", " ", "thousands=' '"),
+        (";", ",", "\u202f", r"thousands='\u202f'"),
+        (",", ".", "'", 'thousands="\'"'),
+        (",", ".", ",", "thousands=',' or decimal=','"),
+    ],
+)
+def test_separated_thousands_are_an_error_with_a_remedy_that_works(
+    tmp_path, sep, decimal, thousands, remedy
+):
+    """Of whole numbers: with a delimiter other than a comma, 101.000 was read as 101."""
+    frame = room()
+    frame["T"] = (1000 * frame["T"] + 100000).round()
+    text = frame.assign(T=[f"{x:,.0f}".replace(",", thousands) for x in frame["T"]])
+    text.to_csv(tmp_path / "a.csv", index=False, sep=sep, decimal=decimal)
+    with pytest.raises(QPError) as error:
+        qm.read_log(tmp_path / "a.csv", **NAMES)
+    assert f"pandas.read_csv(.., sep=.., engine='python', {remedy})" in str(error.value)
+    options: Any = {"sep": sep, "decimal": decimal, "thousands": thousands}
+    read = pd.read_csv(tmp_path / "a.csv", engine="python", **options)
+    assert same(qm.read_log(read, **NAMES), qm.read_log(frame, **NAMES))
+
+
+@pytest.mark.parametrize("rows", [1, 60])
+def test_rows_that_are_there_twice_count_once(rows):
+    """Else the time of a step would be half of it, or a trajectory end."""
+    frame = room()
+    doubled = pd.concat([frame[:rows].loc[frame.index[:rows].repeat(2)], frame[rows:]])
+    log, expected = (qm.read_log(x, **NAMES, time="t") for x in (doubled, frame))
+    assert same(log, expected)
+    assert log.dt == 0.25
+    assert f"{rows} row{'s' * (rows > 1)} left out that repeat the one before" in str(log)
+
+
+def test_an_error_of_a_spreadsheet_is_a_missing_number():
+    column = room()["T"].astype(object)
+    column[7] = "#DIV/0!"
+    log = qm.read_log(room().assign(T=column), **NAMES)
+    assert int(log.trajectories[0].y.isnan().sum()) == 1
 
 
 @pytest.mark.parametrize("time", [None, "", "Unnamed: 0"])
@@ -339,7 +385,11 @@ def test_a_response_that_is_rare_is_no_error():
     (room(), {"episode": "run"}, "column: got 'run', which is missing"),
     (room().assign(q="on"), {}, "column: got q, without a number"),
     *(
-        (room().assign(q=[text, *map(str, range(59))]), {}, f"column: got q with '{text}' in 1")
+        (
+            room().assign(q=[text, *map(str, range(59))]),
+            {},
+            f"column: got q with '{text}' in row 0, one of 1",
+        )
         for text in ("1,234.5", "2,5", "12.3 kW", "-4e", "2020-01-01")
     ),
     *(

@@ -151,6 +151,14 @@ def test_an_answer_that_the_policy_contradicts_is_an_error(monkeypatch):
         largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS)
 
 
+def test_a_question_without_time_stays_undecided():
+    answer = largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS, seconds=1e-9)
+    assert (answer.proved, answer.refuted, answer.bound) == (False, False, np.inf)
+    assert "undecided" in str(answer)
+    with pytest.raises(SolverError, match="does not bound the states in time: allow more seconds"):
+        largest_violation(scheme(), Plant.of(A, B), BOX, **BOUNDS, steps=2, seconds=1e-9)
+
+
 @refused(
     (lambda: Plant.of(A, B, offset=[0.0]), r".*\(n, n\), \(n, n_u\), \(n,\) and \(n, 0\)"),
     (lambda: largest_violation(scheme(), Plant.of(A, B), BOX), ".*no finite bound"),

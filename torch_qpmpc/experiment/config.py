@@ -214,8 +214,8 @@ class Config(Group):
             return cls.model_validate(tree)
         except ValidationError as error:
             # A misspelt key is also a missing one.
-            first = min(error.errors(), key=lambda details: details["type"] != "extra_forbidden")
-            raise _named(first) from None
+            errors = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+            raise _named(errors) from None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -270,23 +270,29 @@ class Config(Group):
         return self
 
 
-def _named(error: Any) -> QPError:
-    """Make the error of a key, in pydantic's words."""
-    kind, value, path = error["type"], error["input"], [*map(str, error["loc"])]
-    if kind == "value_error" and isinstance(error["ctx"]["error"], QPError):
-        return error["ctx"]["error"]
-    # pydantic's path also has choices, entries of lists, and types of unions.
-    known, key = {*keys()}, path[0]
-    for i, part in enumerate(path[1:], 2):
-        longer, unknown = f"{key}.{part}", kind == "extra_forbidden" and i == len(path)
+def _key(error: Any) -> str:
+    """Return the key of an error: pydantic's path also has choices, entries of lists, and types."""
+    (key, *path), known = map(str, error["loc"]), {*keys()}
+    for i, part in enumerate(path, 1):
+        longer, unknown = f"{key}.{part}", error["type"] == "extra_forbidden" and i == len(path)
         key = longer if unknown or any(f"{x}.".startswith(f"{longer}.") for x in known) else key
+    return f"{key}.name" if error["type"].startswith("union_tag") else key
+
+
+def _named(errors: Any) -> QPError:
+    """Make the error of the first key, in pydantic's words for all types that it may have."""
+    kind, value, context = (errors[0].get(name) for name in ("type", "input", "ctx"))
+    if kind == "value_error" and isinstance(context["error"], QPError):
+        return context["error"]
+    key, words = _key(errors[0]), [x["msg"] for x in errors if _key(x) == _key(errors[0])]
     if kind == "extra_forbidden":
         return unknown_key(next(iter(flatten(value, key)), key))
     if kind.startswith("union_tag"):
-        key, value = f"{key}.name", value.get("name")
+        tags = context.get("expected_tags")
+        value, words = value.get("name"), [f"Input should be {tags}" if tags else "Field required"]
     got = "nothing" if kind in ("missing", "union_tag_not_found") else repr(value)
-    words = error["msg"].removeprefix("Value error, ")
-    words = f"{words[:1].lower()}{words[1:]}"
+    words = " or ".join(dict.fromkeys(words)).removeprefix("Value error, ")
+    words = f"{words[:1].lower()}{words[1:]}".replace(" or Input should be", " or")
     return QPError(printable(f"{key}: got {got}, but {words}."))
 
 

@@ -138,14 +138,12 @@ def _tables(variables: Sequence[Variable], dt: float, digest: str) -> str:
     sizes = {"NUMBERS": len(numbers), "VALUES": places[-1], "SETTABLE": places[settable]}
     flags = len(variables) - len(numbers)
     sizes |= {"FLAGS": flags, "FLAGS_": max(flags, 1)}
-    return "\n".join(
-        [
-            f"enum {{ {', '.join(f'{key} = {x}' for key, x in sizes.items())} }};",
-            f"static const double STEP = {dt!r};",
-            f'static const char TOKEN[] = "{digest}";',
-            f"static const int PLACE[] = {{{', '.join(map(str, places))}}};",
-            f"static const double START[] = {{{', '.join(IN_C.get(x, x) for x in values)}}};",
-        ]
+    return (
+        f"enum {{ {', '.join(f'{key} = {x}' for key, x in sizes.items())} }};\n"
+        f"static const double STEP = {dt!r};\n"
+        f'static const char TOKEN[] = "{digest}";\n'
+        f"static const int PLACE[] = {{{', '.join(map(str, places))}}};\n"
+        f"static const double START[] = {{{', '.join(IN_C.get(x, x) for x in values)}}};"
     )
 
 

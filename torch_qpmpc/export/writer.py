@@ -226,14 +226,12 @@ def _examples(settings: Settings, examples: Examples) -> str:
         "NEAR_U": NEAR[dtype] * examples.of_u,
         "NEAR_VALUE": NEAR_VALUE[dtype] * examples.sizes + rounding,
     }
-    return "\n".join(
-        [
-            f"/* States of the self-test: {', '.join(examples.kinds)}. */",
-            f"#define EXAMPLES {len(examples.kinds)}",
-            integers("EXAMPLE_CODE", examples.codes),
-            *(array(name, x, dtype) for name, x in arrays.items()),
-        ]
-    )
+    lines = [
+        f"/* States of the self-test: {', '.join(examples.kinds)}. */",
+        f"#define EXAMPLES {len(examples.kinds)}",
+        integers("EXAMPLE_CODE", examples.codes),
+    ]
+    return "\n".join([*lines, *(array(name, x, dtype) for name, x in arrays.items())])
 
 
 def table_bytes(tables: Tables, settings: Settings) -> int:

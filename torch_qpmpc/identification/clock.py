@@ -276,6 +276,8 @@ def gaps_of(
             f"The times have {gaps.sum()} gaps between steps of {with_unit(dt, unit)}, at each of "
             "which a trajectory ends: is this how they are meant?"
         )
+        back = (change < 0).sum()
+        text += f" {back} of them go back in time: sort the rows." * bool(back)
         warnings.warn(text, UserWarning, stacklevel=5)
     return gaps, dt
 

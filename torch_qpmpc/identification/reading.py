@@ -29,14 +29,14 @@ def read_log(
         data: the path of a CSV file, a DataFrame, a mapping of arrays ``(T,)`` or ``(T, n)``, or a
             list of these, one for each episode; or steps as in `identify`. A unit in a header, as
             in ``T [degC]``, is not part of the name. A shorter array lacks the last row. A file
-            with semicolons or tabs may have decimal commas.
+            with semicolons, tabs or bars may have decimal commas.
         outputs, inputs, known: the names or headers of the columns of y, u and, optionally, d; by
             default ``y``, ``u`` and ``d`` or ``y1``, ``y2``, .. and so on.
         time: the column of times: numbers, dates, periods, time differences or clocks, such as
             ``20260301093000``, ``093000``, ``59:30.5`` or ``24:00``; by default a DataFrame's index
             of these, also as `DataFrame.to_csv` writes it, without a header. Of several readings
-            the one with the most even steps counts. A clock may show one time for several rows; an
-            empty time is as far between its neighbours as its row.
+            the one with the most even steps counts. A clock may show one time for several rows,
+            equal ones count once; an empty time is as far between its neighbours as its row.
         episode: the column of marks that differ between episodes.
         day_first: True for dates such as 29/09/2020, False for 09/29/2020; by default the reading
             with fewer gaps.

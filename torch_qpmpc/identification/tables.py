@@ -28,6 +28,8 @@ FAR, FEW, OFTEN = 10, 0.05, 0.9
 TIME_INDEX, FILE_INDEX = "the index", "Unnamed: 0"
 #: A column's header with its unit, as in ``T [degC]``.
 HEADER = re.compile(r"\s*(.*?)\s*\[([^][]*)\]\s*$")
+#: How pandas reads numbers of other spellings.
+PANDAS = "pandas.read_csv(.., sep=.., engine='python', %s)"
 KINDS = "a CSV file, a DataFrame, a dict of arrays, a list of these, or a TensorDict of steps"
 
 
@@ -60,6 +62,12 @@ def read_tables(
     if episode is not None:
         column = _column(frame, episode)
         marks = marks + (column != column.shift()).cumsum().to_numpy()
+    if times is not None:
+        again = np.diff(times, prepend=np.nan) == 0
+        rows = np.column_stack((np.nan_to_num(values, nan=np.inf), marks))
+        if again.any() and (rows[1:] == rows[:-1])[again[1:]].all():
+            values, times, marks = (x[~again] for x in (values, times, marks))
+            words.append(f"{_count(again.sum(), 'row')} left out that repeat the one before")
     usual = values[(np.abs(values) <= LARGEST).all(1)]
     if noticed := (*_marked(usual, names), *_dependent(usual, names), *_repeated(values, y)):
         warnings.warn(f"In this log, {'; '.join(noticed)}.", UserWarning, stacklevel=3)
@@ -106,8 +114,8 @@ def _frame(part: Any) -> pd.DataFrame:
         try:
             return _read_csv(Path(part))
         except (OSError, ValueError, Warning) as error:
-            got = f"{part}, which cannot be read ({error})"
-            raise QPError.expected("data", got, "a CSV file that begins with a header") from error
+            got, want = f"{part}, which cannot be read ({error})", "a CSV file that begins with"
+            raise QPError.expected("data", got, f"{want} a name for each field") from error
     if isinstance(part, pd.DataFrame):
         if isinstance(part.index, pd.MultiIndex):
             remedy = "Call reset_index(), and name its columns by time= and episode=."
@@ -136,8 +144,8 @@ def _frame(part: Any) -> pd.DataFrame:
 def _read_csv(path: Path) -> pd.DataFrame:
     """Read a CSV file by its header; an empty field beyond that is a delimiter too many.
 
-    The delimiter that the header has most of, of comma, semicolon and tab, is the file's. Unless
-    it is a comma, numbers may have decimal commas.
+    The delimiter that the header has most of, of comma, semicolon, tab and bar, is the file's.
+    Unless it is a comma, all numbers may have decimal commas.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -145,11 +153,16 @@ def _read_csv(path: Path) -> pd.DataFrame:
         is_utf_16 = error.object[:2] in (b"\xff\xfe", b"\xfe\xff")
         text = path.read_text(encoding="utf-16" if is_utf_16 else "cp1252")
     headers = {}
-    for sep in ",;\t":
+    for sep in ",;\t|":
         rows = csv.reader(io.StringIO(text), delimiter=sep, skipinitialspace=True)
         headers[sep] = next(filter(None, rows), [])
     sep = max(headers, key=lambda sep: len(headers[sep]))
     decimal = "." if sep == "," else ","
+    number = rf'(?m)(?:^|[{sep}])\s*"?[-+]?(\d+%s\d+)"?\s*(?=[{sep}]|$)'
+    both = [x[1] for mark in (r"\.", ",") if sep != "," and (x := re.search(number % mark, text))]
+    if len(both) == 2 and any(re.fullmatch(r"\d{1,3}\D\d{3}", x) for x in both):
+        way = PANDAS % "decimal=.., thousands=.."
+        raise ValueError(f"points and commas in {' and '.join(both)}: pass a DataFrame, by {way}")
     options: Any = {"index_col": False, "skipinitialspace": True, "low_memory": False}
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # that fields would be lost
@@ -204,20 +217,27 @@ def _numbers(frame: pd.DataFrame, names: Sequence[str]) -> tuple[np.ndarray, lis
         numbers: Any = pd.to_numeric(column, errors="coerce")
         values[:, i] = np.asarray(numbers, dtype=float)
         words = column[numbers.isna() & column.notna()].astype(str)
-        odd = words[words.str.contains(r"\d") & (words.map(_bare) != name)]
+        odd = words[words.str.contains(r"^[^#]*\d") & (words.map(_bare) != name)]
         if len(odd):
-            got, want = f"{name} with {odd.iloc[0]!r} in {_count(len(odd), 'row')}", "1234.5"
-            remedy = (
-                "Pass a DataFrame: pandas.read_csv(.., sep=';', decimal=',') reads decimal commas, "
-                "and thousands=',' separators; units belong in the header, as in 'q [kW]'."
-            )
-            raise QPError.expected("column", got, want, remedy)
+            got = f"{name} with {odd.iloc[0]!r} in row {odd.index[0]}, one of {len(odd)}"
+            raise QPError.expected("column", got, "1234.5", _remedy(odd.iloc[0]))
         if not np.isfinite(values[:, i]).any():
-            raise QPError.expected("column", f"{name}, without a number", "a column of numbers")
+            raise QPError.expected("column", f"{name}, without a number", "numbers, as 0 and 1")
         if len(words):
             rows = _count(len(words), "row")
             notes.append(f"{name} is no number in {rows}, as in {words.iloc[0]!r}")
     return values, notes
+
+
+def _remedy(text: str) -> str:
+    """Return how to read a text of a number, with a decimal comma or separated thousands."""
+    marks, ways = re.sub(r"^[-+]|\d", "", text), list[str]()
+    if marks and re.fullmatch(r"[.,'\u2019\s]+", marks):
+        ways += [f"thousands={marks[0]!r}"] * bool(re.match(r"[-+]?\d{1,3}(\D\d{3})+(?!\d)", text))
+        ways += ["decimal=','"] * (marks[-1] == "," and marks.count(",") == 1)
+    if not ways:
+        return "Leave a number alone in each cell: units belong in the header, as in 'q [kW]'."
+    return f"Pass a DataFrame: {PANDAS % (', ' if len(marks) > 1 else ' or ').join(ways)}."
 
 
 def _column(frame: pd.DataFrame, name: str) -> Any:

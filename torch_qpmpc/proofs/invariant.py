@@ -15,6 +15,7 @@ Letters 45.
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +25,7 @@ from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
 from torch_qpmpc.proofs.plant import Plant, Polytope, check_plants, positive, support
-from torch_qpmpc.proofs.program import Array
+from torch_qpmpc.proofs.program import Array, Program
 from torch_qpmpc.proofs.questions import TOLERANCE, Answer, action, check_states, invariance
 
 #: Fractions of the bounds that are tried, the largest first.
@@ -67,7 +68,7 @@ def invariant_set(
         mpc: the QP.
         plant: the plant, or several, of which each step may be any.
         states: the set to stay in, such as the states' bounds.
-        seconds: time limit of each mixed-integer program.
+        seconds: time limit, of which each proof may take half of what is left.
 
     Raises:
         QPError: an argument is invalid, the law without multipliers does not stabilise a plant, or
@@ -86,6 +87,7 @@ def invariant_set(
         (1.0, True)
     """
     check_states(mpc, states)
+    until = Program(seconds).until
     plants, tables = check_plants(plant, mpc.n_p, mpc.n_u), make_tables(mpc)
     laws = _laws(tables, plants, np.zeros(mpc.n_u), 1.0)
     if (radius := _radius(laws)) >= 1:
@@ -94,12 +96,12 @@ def invariant_set(
     centre = _equilibrium(laws[0])
     u = tables.K @ centre + tables.k
     for scale, gain in itertools.product(SCALES, GAINS):
-        laws = _laws(tables, plants, u, gain)
-        if _radius(laws) >= 1:
+        laws, left = _laws(tables, plants, u, gain), until - time.perf_counter()
+        if _radius(laws) >= 1 or left <= 0:
             continue
         A, b = _bounds(tables, states, u, gain)
         candidate = _largest(laws, A, scale * b + (1 - scale) * A @ centre, positive(states.size))
-        if candidate and (proof := _proof(mpc, plants, candidate, seconds)) and proof.proved:
+        if candidate and (proof := _proof(mpc, plants, candidate, left / 2)) and proof.proved:
             return InvariantSet(candidate, scale, gain, proof)
     got = f"a set without a part that is proved invariant about p = {centre}, u = {u}"
     want = "one that the linear law can stay in, with these disturbances, as the policy does"

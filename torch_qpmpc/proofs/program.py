@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.optimize import milp
 from scipy.sparse import csr_array, vstack
 
+from torch_qpmpc.checks import check_number
 from torch_qpmpc.errors import SolverError
 
 Array = np.ndarray
@@ -65,9 +67,14 @@ class Maximum:
 
 
 class Program:
-    """Variables x with ``lower <= x <= upper``, some of them 0 or 1, and rows over them."""
+    """Variables x with ``lower <= x <= upper``, some of them 0 or 1, and rows over them.
 
-    def __init__(self) -> None:
+    It and its copies have so many ``seconds`` from now on.
+    """
+
+    def __init__(self, seconds: Any = np.inf) -> None:
+        check_number("seconds", seconds, lambda x: x > 0, "a number of seconds > 0, or inf")
+        self.until = time.perf_counter() + seconds
         self.lower, self.upper, self.binary = (np.zeros(0) for _ in range(3))
         self._rows: list[tuple[Affine, Array, Array]] = []
         self._built: tuple[csr_array, Array, Array] | None = None
@@ -96,31 +103,32 @@ class Program:
         m, self._built = len(rows.constant), None
         self._rows.append((rows, np.broadcast_to(lower, m), np.broadcast_to(upper, m)))
 
-    def maximise(
-        self, objective: Affine, *, relaxed: bool = False, seconds: float = np.inf
-    ) -> Maximum:
+    def maximise(self, objective: Affine, *, relaxed: bool = False) -> Maximum:
         """Maximise one affine function; ``relaxed`` lets binaries lie between 0 and 1.
 
+        The bound is infinite if HiGHS gives none in time.
+
         Raises:
-            SolverError: the program is infeasible, or HiGHS gives no bound in time.
+            SolverError: the program is infeasible.
         """
         cost, relaxed = np.zeros(len(self.lower)), relaxed or not self.binaries
         np.add.at(cost, objective.columns, -objective.matrix[0])
         size = np.abs(cost).max(initial=0.0) or 1.0  # HiGHS' tolerances are absolute
         for presolve in (True, False):  # by presolve's round-off HiGHS can miss an optimum
+            left = max(self.until - time.perf_counter(), 0.0)
             result = milp(
                 cost / size,
                 integrality=np.zeros(len(cost)) if relaxed else self.binary,
                 bounds=(self.lower, self.upper),
                 constraints=self._constraints(),
-                options={"mip_rel_gap": 0.0, "time_limit": seconds, "presolve": presolve},
+                options={"mip_rel_gap": 0.0, "time_limit": left, "presolve": presolve},
             )
             if result.status != UNKNOWN:
                 break
-        bound = result.fun if relaxed else result.get("mip_dual_bound")
-        if bound is None or result.status not in (0, 1):
+        if result.status not in (0, 1):
             raise SolverError(f"HiGHS gave no bound of the worst case: {result.message}")
-        constant = float(objective.constant[0])
+        bound = result.fun if relaxed else result.get("mip_dual_bound")
+        bound, constant = -np.inf if bound is None else bound, float(objective.constant[0])
         value = -np.inf if result.fun is None else constant - size * result.fun
         x = result.x if result.x is not None else np.full(len(cost), np.nan)
         return Maximum(value, constant - size * bound, x, int(result.get("mip_node_count") or 0))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torch_qpmpc.checks import check_kind, check_number, check_whole
+from torch_qpmpc.checks import check_kind, check_whole
 from torch_qpmpc.errors import QPError, SolverError
 from torch_qpmpc.export.tables import Tables, make_tables
 from torch_qpmpc.mpc.module import QPMPC
@@ -83,12 +83,12 @@ def largest_violation(
         states: the set of p_0.
         lower, upper: bounds of p_steps, ``(n_p,)``; None or inf for no bound.
         steps: the number of steps.
-        seconds: time limit of each mixed-integer program.
+        seconds: time limit, after which what is left stays undecided.
 
     Raises:
         QPError: an argument is invalid, or the QP has no plan with slack in its hard rows
             somewhere on the way.
-        SolverError: HiGHS gives no bound in time, or prices are too high for it.
+        SolverError: prices are too high for HiGHS, or it does not bound the states in time.
 
     Example:
         >>> import torch_qpmpc as qm
@@ -138,12 +138,12 @@ def largest_difference(
 
     Raises:
         QPError: the QPs know or do different things, or as in `largest_violation`.
-        SolverError: HiGHS gives no bound in time.
+        SolverError: as there.
     """
     n = max(check_states(one, states) for one in (first, second))
     if first.n_u != second.n_u:
         raise QPError.expected("second", f"{second.n_u} actions", f"{first.n_u}")
-    program, tables = Program(), [make_tables(x) for x in (first, second)]
+    program, tables = Program(seconds), [make_tables(x) for x in (first, second)]
     p, vertices = _known(program, states), states.vertices()
     u, other = (encode(program, x, p, vertices) for x in tables)
     signs = np.concatenate((np.eye(first.n_u), -np.eye(first.n_u)))
@@ -157,7 +157,7 @@ def largest_difference(
     free = [np.abs(x.K) @ states.size + np.abs(x.k) for x in tables]
     bounds = [np.maximum(np.abs(x.u_lower), np.abs(x.u_upper)) for x in tables]
     sizes = np.tile(positive(np.minimum(free, bounds).max(0)), 2)
-    _maximise(answer, program, rows, sizes, replay, seconds)
+    _maximise(answer, program, rows, sizes, replay)
     return answer
 
 
@@ -203,7 +203,7 @@ def _worst(
     if len(plants) ** steps > MOST_MODELS:
         got, want = f"{steps} steps of {len(plants)} plants", f"{MOST_MODELS} combinations"
         raise QPError.expected("steps", got, want)
-    tables, program = make_tables(mpc), Program()
+    tables, program = make_tables(mpc), Program(seconds)
     start = _known(program, states)
     question += f" {steps} step{'s' * int(steps > 1)}"
     answer = Answer(question, tables.digest, np.full((steps + 1, mpc.n_p), np.nan))
@@ -218,7 +218,7 @@ def _worst(
                 run.append(model.A @ run[-1] + model.B @ u + model.offset + model.E @ d)
             return A @ run[-1] - b, np.array(run), noise
 
-        _maximise(answer, branch.program, branch.p.times(A).plus(-b), sizes, replay, seconds)
+        _maximise(answer, branch.program, branch.p.times(A).plus(-b), sizes, replay)
     return answer
 
 
@@ -256,13 +256,11 @@ def _maximise(
     rows: Affine,
     sizes: Array,
     replay: Callable[[Array], tuple[Array, Array, tuple[Array, ...]]],
-    seconds: float,
 ) -> None:
     """Maximise rows of these sizes; ``replay`` maps variables to all rows, the run and its d."""
-    check_number("seconds", seconds, lambda x: x > 0, "a number of seconds > 0, or inf")
     began, answer.binaries = time.perf_counter(), max(answer.binaries, program.binaries)
     for i in range(len(rows.constant)):
-        maximum = program.maximise(rows.part([i]), seconds=seconds)
+        maximum = program.maximise(rows.part([i]))
         answer.bound, answer.nodes = max(answer.bound, maximum.bound), answer.nodes + maximum.nodes
         answer.proved &= bool(maximum.bound <= TOLERANCE * sizes[i])
         if not np.isfinite(maximum.value):
@@ -285,5 +283,7 @@ def _reached(program: Program, p: Affine) -> Polytope:
     for sign in (-1.0, 1.0):
         rows = [p.times(sign * row[None]) for row in np.eye(len(sizes))]
         most = [program.maximise(row, relaxed=True).bound for row in rows]
+        if np.isinf(most).any():
+            raise SolverError("HiGHS does not bound the states in time: allow more seconds.")
         ends.append(sign * (np.array(most) + TOLERANCE * sizes))
     return Polytope.box(*ends)

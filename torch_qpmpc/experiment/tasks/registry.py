@@ -90,13 +90,9 @@ def plant_scheme(
     if state_bounds is None and not isinstance(plant, Plant):
         state_bounds = plant.lb_s, plant.ub_s
     bounds = Bounds(state_bounds=state_bounds, action_bounds=(plant.lb_a, plant.ub_a))
-    return Scheme(
-        plant_layout(plant, cfg.task.horizon),
-        model,
-        Cost(stage_weight, hessian=cfg.task.hessian),
-        priced(cfg, bounds),
-        cfg.task.gamma,
-    )
+    layout = plant_layout(plant, cfg.task.horizon)
+    cost = Cost(stage_weight, hessian=cfg.task.hessian)
+    return Scheme(layout, model, cost, priced(cfg, bounds), cfg.task.gamma)
 
 
 def priced(cfg: Config, bounds: Bounds) -> Bounds:
