@@ -78,61 +78,44 @@ class Reduced(NamedTuple):
     """The QPs in v, the entries of y after the n_f fixed ones.
 
     A leading B is 1 where the batch shares the vector.
-
-    Attributes:
-        rows, others: the indices of G's rows with a finite bound and a free variable, ``(r,)``, and
-            of the rest.
-        H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
-            ``constant + matrix' fixed``.
-        z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
-        w: ``(B, r)``.
-        T, factors, pivots: see `Elimination`.
     """
 
+    #: The indices of G's rows with a finite bound and a free variable, ``(r,)``, and of the rest.
     rows: Array
     others: Array
+    #: ``(M, d, d)`` and ``(M, r, d)``.
     H: Array
     G: Array
+    #: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
+    #: ``constant + matrix' fixed``.
     matrix: Array
     constant: Array
-    z_0: Array
-    w: Array
+    z_0: Array  # ``(B, n_z)``, z if the fixed entries and v are zero
+    w: Array  # ``(B, r)``
+    #: See `Elimination`.
     T: Array
     factors: Array
     pivots: Array
 
 
 class Sizes(NamedTuple):
-    """Sizes that bound the error of a value, see `torch_qpmpc.qp.kernels.sample`.
+    """Sizes that bound the error of a value, see `torch_qpmpc.qp.kernels.sample`."""
 
-    Attributes:
-        inverse: the inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is
-            none.
-        shift: zero for a definite H, ``(M,)``.
-        stiffness: a bound of H's eigenvalues, ``(M,)``.
-        costs, rows, equalities: the sums of absolute entries of the rows of H, G and C,
-            ``(M, n_z)``, ``(M, n_g)`` and ``(M, n_c)``.
-        steps: the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable.
-        hard: the indices of rows that are hard in some QP, ``(h,)``.
-        box: the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one.
-        bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
-        units: the hard rows in v, of unit length, ``(M, h, d)``.
-        spans: those of `Condensed`.
-    """
-
+    #: The inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is none.
     inverse: Array
-    shift: Array
-    stiffness: Array
+    shift: Array  # zero for a definite H, ``(M,)``
+    stiffness: Array  # a bound of H's eigenvalues, ``(M,)``
+    #: The sums of absolute entries of the rows of H, G and C, ``(M, n_z)``, ``(M, n_g)`` and
+    #: ``(M, n_c)``.
     costs: Array
     rows: Array
     equalities: Array
-    steps: Array
-    hard: Array
-    box: Array
-    bounds: Array
-    units: Array
-    spans: tuple[Array, ...]
+    steps: Array  # the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable
+    hard: Array  # the indices of rows that are hard in some QP, ``(h,)``
+    box: Array  # the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one
+    bounds: Array  # the same for the entries of z, ``(n_z,)``, of rows of G itself
+    units: Array  # the hard rows in v, of unit length, ``(M, h, d)``
+    spans: tuple[Array, ...]  # those of `Condensed`
 
 
 class Dual(NamedTuple):
