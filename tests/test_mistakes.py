@@ -99,8 +99,8 @@ def released_step() -> None:
 
 MISTAKES: list[tuple[str, Callable[[], Any]]] = [
     # The QP and its module
-    ("q: got torch.float32, expected H's dtype torch.float64.", Q(q=GOOD["q"].float())),
-    ("q: got a tensor on meta, expected one on cpu. Move", Q(q=GOOD["q"].to("meta"))),
+    ("q: got torch.float32, expected H's dtype torch.float64. Give all", Q(q=GOOD["q"].float())),
+    ("q: got a tensor on meta, expected one on H's device, cpu. Move", Q(q=GOOD["q"].to("meta"))),
     ("H: got torch.float16", lambda: qm.QuadraticProgram(**{k: v.half() for k, v in GOOD.items()})),
     ("qp: got dict, expected a QuadraticProgram. Pass", lambda: qm.solve_qp(GOOD)),
     (

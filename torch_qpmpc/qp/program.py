@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_qpmpc.checks import check_tensor, check_whole
+from torch_qpmpc.checks import check_whole
 from torch_qpmpc.errors import QPError
 
 #: Trailing (event) dimensions of each tensor of a QP, in the order of the constructor.
@@ -201,12 +201,22 @@ class QuadraticProgram:
 
     def _check_events(self) -> None:
         for name, x in zip(EVENT_SHAPES, self.tensors(), strict=True):
-            check_tensor(name, x, device=getattr(self.H, "device", None))
-            if x.dtype not in DTYPES:
+            if not isinstance(x, Tensor) or not x.is_floating_point():
+                got = x.dtype if isinstance(x, Tensor) else type(x).__name__
+                expected = "a floating-point torch.Tensor"
+                remedy = "Convert it with torch.as_tensor(..., dtype=torch.float64)."
+            elif x.dtype not in DTYPES:
+                got, expected = x.dtype, "torch.float32 or torch.float64"
                 remedy = "Half precision has no matrix factorisations: use torch.float64."
-                raise QPError.expected(name, x.dtype, "torch.float32 or torch.float64", remedy)
-            if x.dtype != self.H.dtype:
-                raise QPError.expected(name, x.dtype, f"H's dtype {self.H.dtype}")
+            elif x.device != self.H.device:
+                got, expected = f"a tensor on {x.device}", f"one on H's device, {self.H.device}"
+                remedy = "Move all nine to one device."
+            elif x.dtype != self.H.dtype:
+                got, expected = x.dtype, f"H's dtype {self.H.dtype}"
+                remedy = "Give all nine tensors one dtype."
+            else:
+                continue
+            raise QPError.expected(name, got, expected, remedy)
         sizes: dict[str, tuple[str, int]] = {}
         for (name, event), x in zip(EVENT_SHAPES.items(), self.tensors(), strict=True):
             if x.ndim < len(event):
