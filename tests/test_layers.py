@@ -36,7 +36,7 @@ BUDGET = {
     "identification": 2756,  # drifts keep steady gains right
     "mpc": 3778,
     "proofs": 991,
-    "qp": 5207,
+    "qp": 5206,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
 }
 #: Libraries that only some layers may import.
