@@ -37,13 +37,34 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
     return html
 
 
+def described_fields(lines: list[str]) -> list[str]:
+    """Return what comments at the fields of a class say, ``#:`` of all up to the next comment."""
+    found: list[list[str]] = []
+    above: list[str] = []
+    for line in lines:
+        if comment := re.match(r"    #: (.*)", line):
+            above.append(comment[1])
+        elif field := re.match(r"    (\w+): .*?(?:  # (?!pyright|noqa)(.*))?$", line):
+            if above or field[2] or not found:
+                found.append([field[1], field[2] or " ".join(above), *above])
+            elif len(found[-1]) > 2:
+                found[-1][0] += f", {field[1]}"
+            above = []
+    return [f"    {names}: {text}" for names, text, *_ in found if text]
+
+
 class Docstrings(griffe.Extension):
-    """Read ``Example:`` as doctests, and ``A, B: ..`` as two parameters, which Griffe does not."""
+    """Read ``Example:`` as doctests, ``A, B: ..`` as two parameters, and comments at fields."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is None:
             return
         text = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
+        parts = [x.value for x in getattr(obj, "decorators", ())] + getattr(obj, "bases", [])
+        of_data = re.search("dataclass|NamedTuple", " ".join(map(str, parts)))
+        if of_data and not re.search("(?m)^(Args|Attributes):$", text):
+            fields = described_fields(obj.lines)
+            text += "\n\nAttributes:\n" + "\n".join(fields) if fields else ""
         # What follows a space would be taken for the type; a no-break space is part of the name.
         names = re.compile(r"(?m)^ {4}\w+(?:, \w+)+(?=:\s)")
         obj.docstring.value = names.sub(lambda m: m[0].replace(", ", ",\u00a0"), text)

@@ -212,9 +212,10 @@ def soft_qps(known: KnownQP) -> tuple[SoftQPs, BackendSolution]:
     reduced, programs = reduced_of(known), programs_of(known)
     fixed = to_tensor(programs.fixed)
     free = torch.cat((fixed, fixed.new_zeros(len(programs), reduced.H.shape[-1])), dim=-1)
-    start = multiply(reduced.T, to_tensor(programs.group), free) + reduced.z_0
+    T = to_tensor(programs.prepared.condensed(programs.n_f).T)
+    start = multiply(T, to_tensor(programs.group), free) + reduced.z_0
     v = known.z.reshape(len(programs), -1) - start
-    v = times(torch.linalg.pinv(reduced.T[:, :, -reduced.H.shape[-1] :]), v)
+    v = times(torch.linalg.pinv(T[:, :, -reduced.H.shape[-1] :]), v)
     lam = known.lam.reshape(len(programs), -1)[:, reduced.rows]
     steps = torch.zeros(len(programs), dtype=torch.int64)
     return SoftQPs._make(map(to_tensor, programs.reduced_qps())), BackendSolution(v, lam, steps)

@@ -218,21 +218,17 @@ def _split(Q: Array, Y: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """The steady states of a plant, as linear maps of [w; d; 1].
+    """The steady states of a plant, as linear maps of [w; d; 1]."""
 
-    Attributes:
-        X, U, Y: the maps of v, without a unit, to x_s, u_s and y_s, with n_v columns.
-        x, u, y: the maps of [w; d; 1] to them, with n_w + n_d + 1 columns.
-        W: the weight of f, ``(n_f, n_f)``: the inputs', in place of zero that of their sizes.
-    """
-
+    #: The maps of v, without a unit, to x_s, u_s and y_s, with n_v columns.
     X: Array
     U: Array
     Y: Array
+    #: The maps of [w; d; 1] to them, with n_w + n_d + 1 columns.
     x: Array
     u: Array
     y: Array
-    W: Array
+    W: Array  # the weight of f, ``(n_f, n_f)``: the inputs', in place of zero that of their sizes
 
     @cached_property
     def maps(self) -> tuple[Array, Array]:

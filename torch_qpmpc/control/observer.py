@@ -38,26 +38,20 @@ class Observer(NamedTuple):
 
     P is the covariance of e given the outputs that there were, around the e that knows all of them:
     zero once all were seen for long.
-
-    Attributes:
-        F, G, E, offset, H: the model of e, and its outputs.
-        S: the covariance of y - H e in the steady state, ``(n_y, n_y)``.
-        P: the first P, zero without a log, ``(n_e, n_e)``.
-        gains: L_0, .., L_T, ``(T + 1, n_e, n_y)``: the steady one at last, alone without a log.
-        start: the mean of e in the log, where a controller starts.
-        rest: the map of [-G u - E d - offset; y] to the e that rests with u, d and y, where it
-            starts without a log.
     """
 
+    #: The model of e, and its outputs.
     F: Array
     G: Array
     E: Array
     offset: Array
     H: Array
-    S: Array
-    P: Array
-    gains: Array
-    start: Array
+    S: Array  # the covariance of y - H e in the steady state, ``(n_y, n_y)``
+    P: Array  # the first P, zero without a log, ``(n_e, n_e)``
+    gains: Array  # L_0, .., L_T, ``(T + 1, n_e, n_y)``: the steady one at last, alone without a log
+    start: Array  # the mean of e in the log, where a controller starts
+    #: The map of [-G u - E d - offset; y] to the e that rests with u, d and y, where it starts
+    #: without a log.
     rest: Array
 
     @property

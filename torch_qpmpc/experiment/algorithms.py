@@ -34,21 +34,14 @@ from torch_qpmpc.mpc.module import QPMPC
 
 @dataclass(frozen=True)
 class Learner:
-    """The objects that update theta.
+    """The objects that update theta."""
 
-    Attributes:
-        learn: updates theta from a batch.
-        loss_module: the loss.
-        actor: maps observation to action, without exploration.
-        penalties: those that are on.
-    """
-
-    learn: Update
-    loss_module: QPQLearningLoss
-    actor: TensorDictModuleBase
+    learn: Update  # updates theta from a batch
+    loss_module: QPQLearningLoss  # the loss
+    actor: TensorDictModuleBase  # maps observation to action, without exploration
     optimizer: torch.optim.Optimizer
     scheduler: LambdaLR
-    penalties: Penalties
+    penalties: Penalties  # those that are on
 
     def centre(self, replay: Replay) -> float:
         """Make the mean TD error of the stored steps zero by c alone; return the change of c.

@@ -29,22 +29,16 @@ from torch_qpmpc.qp.pipeline.solve import SolveLog
 
 @dataclass
 class Tally:
-    """Running totals over the updates of a run.
+    """Running totals over the updates of a run."""
 
-    Attributes:
-        update: number of the last update.
-        costs: mean stage cost of each update.
-        qps: counts of solves since the last row of metrics.
-        unsolved, accepted: numbers of unsolved QPs before that, and of updates that moved theta.
-        seconds: training time without the compilation of kernels.
-    """
-
-    update: int = 0
-    costs: list[float] = field(default_factory=list)
+    update: int = 0  # number of the last update
+    costs: list[float] = field(default_factory=list)  # mean stage cost of each update
+    #: Counts of solves since the last row of metrics.
     qps: SolveLog = field(default_factory=SolveLog)
+    #: Numbers of unsolved QPs before that, and of updates that moved theta.
     unsolved: int = 0
     accepted: int = 0
-    seconds: float = 0.0
+    seconds: float = 0.0  # training time without the compilation of kernels
 
     def state_dict(self) -> dict[str, Any]:
         """Return the tally as plain numbers, for a checkpoint."""

@@ -40,68 +40,53 @@ Array = np.ndarray
 
 
 class Rows(NamedTuple):
-    """Rows ``lower <= Y p + .. <= upper`` with weights w; the offset of y is in the bounds.
+    """Rows ``lower <= Y p + .. <= upper`` with weights w; the offset of y is in the bounds."""
 
-    Attributes:
-        Y: ``(r, n_p)``, y without multipliers is ``Y p``.
-        lower, upper, w: ``(r,)``, infinite where there is no bound or the row is hard.
-        size: ``(r,)``, the terms of y without p and multipliers; in rows of p alone with a floor.
-        unit: ``(r,)``, y in the units of G's row is ``unit`` times that of the table.
-    """
-
-    Y: Array
+    Y: Array  # ``(r, n_p)``, y without multipliers is ``Y p``
+    #: ``(r,)``, infinite where there is no bound or the row is hard.
     lower: Array
     upper: Array
     w: Array
+    #: ``(r,)``, the terms of y without p and multipliers; in rows of p alone with a floor.
     size: Array
-    unit: Array
+    unit: Array  # ``(r,)``, y in the units of G's row is ``unit`` times that of the table
 
 
 @dataclass(frozen=True, eq=False)
 class Tables:
-    """The tables of a policy in float64.
+    """The tables of a policy in float64."""
 
-    Attributes:
-        n_p, n_u: the numbers of known entries and of actions.
-        rows, places: the rows that v changes, scaled to Q_ii = 1, and their places in G.
-        known: the rows that p alone determines.
-        Q: ``(r, r)``.
-        R: ``(r, d)`` with Q = R R', where d is the size of v.
-        K, k: ``(n_u, n_p)`` and ``(n_u,)``; u_0 without multipliers is ``K p + k``.
-        F: ``(n_u, r)``, the response of u_0 to multipliers is ``-F lam``.
-        P, g, c: ``(n_p, n_p)``, ``(n_p,)`` and a number; the value without multipliers is
-            ``p'Pp / 2 + g'p + c``.
-        u_lower, u_upper: ``(n_u,)``, the hard bounds of rows that contain one action only.
-        condition: the condition number of H_v in an orthonormal basis of the plan.
-        centre: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
-        usual: ``(n_p,)``, the size of an entry of p whose own cost is a half, one without a cost.
-        constants: entries of p with one value only.
-        levels, decisions: those of actions, None without any, and their arrays by names in C.
-        digest: SHA-256 of the nine tensors of the QP.
-    """
-
+    #: The numbers of known entries and of actions.
     n_p: int
     n_u: int
+    #: The rows that v changes, scaled to Q_ii = 1, and their places in G.
     rows: Rows
     places: Array
-    known: Rows
-    Q: Array
-    R: Array
+    known: Rows  # the rows that p alone determines
+    Q: Array  # ``(r, r)``
+    R: Array  # ``(r, d)`` with Q = R R', where d is the size of v
+    #: ``(n_u, n_p)`` and ``(n_u,)``; u_0 without multipliers is ``K p + k``.
     K: Array
     k: Array
-    F: Array
+    F: Array  # ``(n_u, r)``, the response of u_0 to multipliers is ``-F lam``
+    #: ``(n_p, n_p)``, ``(n_p,)`` and a number; the value without multipliers is
+    #: ``p'Pp / 2 + g'p + c``.
     P: Array
     g: Array
     c: float
+    #: ``(n_u,)``, the hard bounds of rows that contain one action only.
     u_lower: Array
     u_upper: Array
-    condition: float
+    condition: float  # the condition number of H_v in an orthonormal basis of the plan
+    #: ``(n_p,)``, a p with a plan near the middle of its bounds, zero if there is none.
     centre: Array
+    #: ``(n_p,)``, the size of an entry of p whose own cost is a half, one without a cost.
     usual: Array
-    constants: Mapping[int, float]
+    constants: Mapping[int, float]  # entries of p with one value only
+    #: Those of actions, None without any, and their arrays by names in C.
     levels: Levels | None
     decisions: dict[str, Array]
-    digest: str
+    digest: str  # SHA-256 of the nine tensors of the QP
 
 
 def make_tables(mpc: QPMPC) -> Tables:

@@ -28,43 +28,25 @@ SINGULAR = 1e-12
 
 
 class Course(NamedTuple):
-    """The filter's matrices, as often as they change; those of missing outputs are zero.
+    """The filter's matrices, as often as they change; those of missing outputs are zero."""
 
-    Attributes:
-        P: the covariances before the outputs, ``(D, n, n)``.
-        K: the gains, ``(D, n, n_y)``.
-        V: the covariances of the innovations, ``(D, n_y, n_y)``.
-        inverse: their pseudoinverses.
-        half: half of the logarithms of their determinants, ``(D,)``.
-        at: the place of each step's matrices among these, ``(T,)``.
-        after: P_T, before the outputs that follow.
-    """
-
-    P: Array
-    K: Array
-    V: Array
-    inverse: Array
-    half: Array
-    at: Array
-    after: Array
+    P: Array  # the covariances before the outputs, ``(D, n, n)``
+    K: Array  # the gains, ``(D, n, n_y)``
+    V: Array  # the covariances of the innovations, ``(D, n_y, n_y)``
+    inverse: Array  # their pseudoinverses
+    half: Array  # half of the logarithms of their determinants, ``(D,)``
+    at: Array  # the place of each step's matrices among these, ``(T,)``
+    after: Array  # P_T, before the outputs that follow
 
 
 class Smoothed(NamedTuple):
-    """States given all outputs.
+    """States given all outputs."""
 
-    Attributes:
-        x: means ``(G, T, n)``.
-        P: covariances ``(D, n, n)``, as often as they change.
-        at: the place of each step's covariance among these, ``(T,)``.
-        cross: the sum of neighbours' covariances, ``(n, n)``.
-        likelihood: its logarithm, up to a constant.
-    """
-
-    x: Array
-    P: Array
-    at: Array
-    cross: Array
-    likelihood: float
+    x: Array  # means ``(G, T, n)``
+    P: Array  # covariances ``(D, n, n)``, as often as they change
+    at: Array  # the place of each step's covariance among these, ``(T,)``
+    cross: Array  # the sum of neighbours' covariances, ``(n, n)``
+    likelihood: float  # its logarithm, up to a constant
 
     def total(self, steps: Any) -> Array:
         """Return the sum of the covariances of ``steps``, an index of ``(T,)``."""

@@ -86,25 +86,19 @@ class Candidate(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """An identified model, and how it was chosen.
+    """An identified model, and how it was chosen."""
 
-    Attributes:
-        model: the model.
-        order, lags: as in `fit_state_space`.
-        candidates: those that were compared.
-        parts: models that have not seen the outputs of a part of the log each.
-        drifts: the number of modes that no input moves.
-        plant: the model without these, whose E has the columns of known signals and of the drifts
-            w, and C_w ``(n_y, n_w)``, so that y = C x + C_w w; w changes by one in the root mean
-            square of the steps. None without drifts, or with outputs that no input moves.
-    """
-
-    model: Innovations
+    model: Innovations  # the model
+    #: As in `fit_state_space`.
     order: int
     lags: int
-    candidates: tuple[Candidate, ...] = ()
+    candidates: tuple[Candidate, ...] = ()  # those that were compared
+    #: Models that have not seen the outputs of a part of the log each.
     parts: tuple[Innovations, ...] = ()
-    drifts: int = 0
+    drifts: int = 0  # the number of modes that no input moves
+    #: The model without these, whose E has the columns of known signals and of the drifts w, and
+    #: C_w ``(n_y, n_w)``, so that y = C x + C_w w; w changes by one in the root mean square of the
+    #: steps. None without drifts, or with outputs that no input moves.
     plant: tuple[Innovations, Array] | None = None
 
 

@@ -41,25 +41,16 @@ MOST = 100
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """The decisions of a scheme on m actions with levels, in S stages.
+    """The decisions of a scheme on m actions with levels, in S stages."""
 
-    Attributes:
-        actions: the places of the actions in u, ``(m,)``.
-        rows: the row of G that each decision holds, ``(m, S)``.
-        entries: the entry of z that is the decision, ``(m, S)``; None if rows hold sums of several.
-        values: ascending levels, ``(m, L)``; the highest one fills the row.
-        rules: the fewest steps off and on, ``(m, 2)``.
-        starts: the costs of going on, ``(m, S)``.
-        max_nodes: the most nodes of a search.
-    """
-
-    actions: np.ndarray
-    rows: np.ndarray
+    actions: np.ndarray  # the places of the actions in u, ``(m,)``
+    rows: np.ndarray  # the row of G that each decision holds, ``(m, S)``
+    #: The entry of z that is the decision, ``(m, S)``; None if rows hold sums of several.
     entries: np.ndarray | None
-    values: np.ndarray
-    rules: np.ndarray
-    starts: np.ndarray
-    max_nodes: int
+    values: np.ndarray  # ascending levels, ``(m, L)``; the highest one fills the row
+    rules: np.ndarray  # the fewest steps off and on, ``(m, 2)``
+    starts: np.ndarray  # the costs of going on, ``(m, S)``
+    max_nodes: int  # the most nodes of a search
 
     @classmethod
     def of(cls, scheme: Any) -> Levels | None:

@@ -34,17 +34,14 @@ FLOOR, TOLERANCE, ITERATIONS = 1e-2, 1e-9, 500
 
 @dataclass(frozen=True, eq=False)
 class StageCost:
-    """``1/2 v'Wv + q'v + c`` of v = [d; x; u].
+    """``1/2 v'Wv + q'v + c`` of v = [d; x; u]."""
 
-    Attributes:
-        W, q, c: ``(n, n)``, ``(n,)`` and ``()``.
-        R2: the share of the observed costs' variance that it explains, adjusted for the number of
-            its coefficients; NaN if there are not more observations than coefficients.
-    """
-
+    #: ``(n, n)``, ``(n,)`` and ``()``.
     W: Tensor
     q: Tensor
     c: Tensor
+    #: The share of the observed costs' variance that it explains, adjusted for the number of its
+    #: coefficients; NaN if there are not more observations than coefficients.
     R2: float = torch.nan
 
     def __call__(self, v: Tensor) -> Tensor:

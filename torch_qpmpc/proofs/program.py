@@ -51,19 +51,12 @@ class Affine:
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """The outcome of a maximisation.
+    """The outcome of a maximisation."""
 
-    Attributes:
-        value: the objective at ``x``; -inf if no point was reached.
-        bound: no point has a larger objective, but for the solver's tolerances.
-        x: the variables.
-        nodes: nodes of the branch-and-bound tree.
-    """
-
-    value: float
-    bound: float
-    x: Array
-    nodes: int
+    value: float  # the objective at ``x``; -inf if no point was reached
+    bound: float  # no point has a larger objective, but for the solver's tolerances
+    x: Array  # the variables
+    nodes: int  # nodes of the branch-and-bound tree
 
 
 class Program:

@@ -44,9 +44,9 @@ def recall(active, group, fixed, dual, qps):
         What `torch_qpmpc.qp.kernels.sample.recover` does, with one more than the number of changes
         of the set as iterations.
     """
-    _, reduced, sizes = qps.parts
+    _, condensed, reduced, _ = qps.parts
     B, (r, d), w = len(fixed), reduced.G.shape[1:], reduced.w
-    g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), sizes.spans[0][:0]
+    g_l_u, spans = offsets(fixed, group, reduced.matrix, reduced.constant), condensed.spans[0][:0]
     g = g_l_u[:, :d].copy()
     slope, v, free, steps = g, np.zeros((B, d)), np.zeros((B, r)), np.ones(B, np.int64)
     lam, last, force = np.zeros((B, r)), np.zeros((B, r)), np.zeros((B, r))

@@ -114,16 +114,16 @@ def recover(v, lam_v, iterations, group, fixed, qps, passes):
     Returns:
         The parts of `BatchSolution`, SOLVED or NOT_CONVERGED.
     """
-    theta, reduced, sizes = qps.parts
+    theta, condensed, reduced, _ = qps.parts
     n_qps, n_f = fixed.shape
     H, C, G, q = theta.H, theta.C, theta.G, theta.q
-    factors, pivots = reduced.factors, reduced.pivots
-    of_H, of_C, of_G, of_T, of_factors = sizes.spans
+    factors, pivots = condensed.factors, condensed.pivots
+    of_H, of_C, of_G, of_T, of_factors = condensed.spans
     kept = np.empty((n_qps, n_f + v.shape[1]))
     for i in range(n_qps):
         copy(kept[i, :n_f], fixed[i])
         copy(kept[i, n_f:], v[i])
-    z = products(reduced.T, group, kept, of_T)
+    z = products(condensed.T, group, kept, of_T)
     for i in range(n_qps):
         add(z[i], 1.0, reduced.z_0[i % len(reduced.z_0)])
     Cz = products(C, group, z, of_C)
@@ -201,11 +201,11 @@ def judge(z, lam, chi, group, fixed, qps, terms):
         of its terms; or, if larger, the sum of the errors in C z = b, weighted by |chi|, and of the
         rows' complementarity gaps, relative to the cost.
     """
-    theta, reduced, sizes = qps.parts
+    theta, condensed, reduced, sizes = qps.parts
     Hz, G_lam, C_chi, left, y, Cz = terms
     H, C, G, q, c, b, lb, ub, w = theta
-    n_f = fixed.shape[1]
-    slopes = transposed_products(reduced.T, group, left, sizes.spans[3])
+    T, of_T, (of_H, of_G, of_C) = condensed.T, condensed.spans[3], condensed.sums
+    n_f, slopes = fixed.shape[1], transposed_products(T, group, left, of_T)
     value, residual, error = np.empty(len(z)), np.empty(len(z)), np.empty(len(z))
     d = reduced.H.shape[1]
     basis, ends, slacks = np.empty((d + 1, d)), np.empty(d + 1), np.empty(d + 1)
@@ -229,8 +229,8 @@ def judge(z, lam, chi, group, fixed, qps, terms):
         scale = max(abs(cost), abs(linear), abs(quadratic), charge)
         scale = max(min(scale, CANCELLED * abs(cost)), FLOOR)
         scale = max(scale, SHARE * _swing(Hz[i], q_i, lb_i, ub_i, w_i, G_m, sizes.bounds, length))
-        noise = _weighted(z[i], sizes.costs[m]) + _weighted(lam[i], sizes.rows[m])
-        noise = length * (noise + _weighted(chi[i], sizes.equalities[m]))
+        noise = _weighted(z[i], of_H[m]) + _weighted(lam[i], of_G[m])
+        noise = length * (noise + _weighted(chi[i], of_C[m]))
         if not ROUNDING * noise < DOUBTFUL * scale:  # the same without the largest entry of z
             noise = _terms(z[i], H_m, z[i]) + _terms(lam[i], G_m, z[i])
             noise += _terms(chi[i], C_m, z[i])
@@ -243,9 +243,9 @@ def judge(z, lam, chi, group, fixed, qps, terms):
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
             of_slope = split if split < of_slope else of_slope
             own, cost_slope = group[i : i + 1], (Hz[i] + q_i).reshape(1, -1)
-            slope = transposed_products(reduced.T, own, cost_slope, sizes.spans[3])[0, n_f:]
+            slope = transposed_products(T, own, cost_slope, of_T)[0, n_f:]
             split = _split_fall(slope, lb_i, ub_i, w_i, far, *curved, steps, box)
-            factors = (reduced.factors, reduced.pivots, sizes.spans[4])
+            factors = (condensed.factors, condensed.pivots, condensed.spans[4])
             free_chi = multipliers(*factors, own, cost_slope)[0]
             split += charge + _shortage(Cz[i], b_i, free_chi)
             if split < gap + of_slope:

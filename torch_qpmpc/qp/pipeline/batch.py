@@ -133,8 +133,8 @@ class Prepared:
 
     @kept
     def held(self, n_f: int) -> Held:
-        """Return theta, the reduced QPs and their sizes as one argument of kernels."""
-        return held((self.theta, self.reduced(n_f), self.sizes(n_f)))
+        """Return theta, the condensed and reduced QPs, and sizes as one argument of kernels."""
+        return held((self.theta, self.condensed(n_f), self.reduced(n_f), self.sizes(n_f)))
 
     def bounded(self, lb: np.ndarray, ub: np.ndarray) -> Prepared:
         """Return the same theta with other bounds of the rows that have some, in the same units."""

@@ -78,61 +78,34 @@ class Reduced(NamedTuple):
     """The QPs in v, the entries of y after the n_f fixed ones.
 
     A leading B is 1 where the batch shares the vector.
-
-    Attributes:
-        rows, others: the indices of G's rows with a finite bound and a free variable, ``(r,)``, and
-            of the rest.
-        H, G: ``(M, d, d)`` and ``(M, r, d)``.
-        matrix, constant: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
-            ``constant + matrix' fixed``.
-        z_0: ``(B, n_z)``, z if the fixed entries and v are zero.
-        w: ``(B, r)``.
-        T, factors, pivots: see `Elimination`.
     """
 
+    #: The indices of G's rows with a finite bound and a free variable, ``(r,)``, and of the rest.
     rows: Array
     others: Array
+    #: ``(M, d, d)`` and ``(M, r, d)``.
     H: Array
     G: Array
+    #: ``(M, n_f, d + 2 r)`` and ``(B, d + 2 r)``. The g, l and u of a sample are
+    #: ``constant + matrix' fixed``.
     matrix: Array
     constant: Array
-    z_0: Array
-    w: Array
-    T: Array
-    factors: Array
-    pivots: Array
+    z_0: Array  # ``(B, n_z)``, z if the fixed entries and v are zero
+    w: Array  # ``(B, r)``
 
 
 class Sizes(NamedTuple):
-    """Sizes that bound the error of a value, see `torch_qpmpc.qp.kernels.sample`.
+    """Sizes that bound the error of a value, see `torch_qpmpc.qp.kernels.sample`."""
 
-    Attributes:
-        inverse: the inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is
-            none.
-        shift: zero for a definite H, ``(M,)``.
-        stiffness: a bound of H's eigenvalues, ``(M,)``.
-        costs, rows, equalities: the sums of absolute entries of the rows of H, G and C,
-            ``(M, n_z)``, ``(M, n_g)`` and ``(M, n_c)``.
-        steps: the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable.
-        hard: the indices of rows that are hard in some QP, ``(h,)``.
-        box: the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one.
-        bounds: the same for the entries of z, ``(n_z,)``, of rows of G itself.
-        units: the hard rows in v, of unit length, ``(M, h, d)``.
-        spans: those of `Condensed`.
-    """
-
+    #: The inverse of the Cholesky factor of H + shift I, ``(M, d, d)``; inf if there is none.
     inverse: Array
-    shift: Array
-    stiffness: Array
-    costs: Array
-    rows: Array
-    equalities: Array
-    steps: Array
-    hard: Array
-    box: Array
-    bounds: Array
-    units: Array
-    spans: tuple[Array, ...]
+    shift: Array  # zero for a definite H, ``(M,)``
+    stiffness: Array  # a bound of H's eigenvalues, ``(M,)``
+    steps: Array  # the norms of G's rows in v, ``(M, n_g)``, zero where they contain no variable
+    hard: Array  # the indices of rows that are hard in some QP, ``(h,)``
+    box: Array  # the index of a row that contains only v_k, for each k, ``(d,)``; -1 without one
+    bounds: Array  # the same for the entries of z, ``(n_z,)``, of rows of G itself
+    units: Array  # the hard rows in v, of unit length, ``(M, h, d)``
 
 
 class Dual(NamedTuple):
@@ -183,7 +156,7 @@ def _products(left: np.ndarray, right: np.ndarray, *spans: np.ndarray) -> np.nda
 @np.errstate(all="ignore")
 def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> Reduced:
     """Reduce condensed QPs to those with the first n_f entries fixed."""
-    T, factors, pivots, H, G, *_ = condensed
+    T, H, G = condensed.T, condensed.H, condensed.G
     bounded = ((theta.lb > -np.inf) | (theta.ub < np.inf)).any(0)
     entering = bounded & condensed.enters[:, n_f:].any(-1)
     rows, others = np.flatnonzero(entering), np.flatnonzero(~entering)
@@ -192,14 +165,14 @@ def reduce(condensed: Condensed, theta: Theta, group: np.ndarray, n_f: int) -> R
     matrix = np.concatenate((fixed_g, fixed_y, fixed_y), axis=-1)
     d, r, lb, ub = H.shape[1], len(rows), theta.lb[:, rows], theta.ub[:, rows]
     of_H, _, of_G, of_T, of_C = condensed.spans
-    z_0 = kernels.particular(factors, pivots, of_C, group, theta.b, T.shape[1])
+    z_0 = kernels.particular(*condensed[1:3], of_C, group, theta.b, T.shape[1])
     of_y = kernels.products(theta.G, group, z_0, of_G)[:, rows]
     slope = theta.q + kernels.products(theta.H, group, z_0, of_H)
     of_v = kernels.transposed_products(T, group, slope, of_T)[:, n_f:]
     constant = np.empty((max(map(len, (of_v, of_y, lb, ub))), d + 2 * r))
     constant[:, :d], constant[:, d : d + r], constant[:, d + r :] = of_v, lb - of_y, ub - of_y
     arrays = (H[:, :, n_f:], G[:, :, n_f:], matrix, constant, z_0, theta.w[:, rows])
-    return Reduced._make((rows, others, *map(np.ascontiguousarray, arrays), T, factors, pivots))
+    return Reduced(rows, others, *map(np.ascontiguousarray, arrays))
 
 
 @np.errstate(all="ignore")
@@ -220,8 +193,7 @@ def sizes(condensed: Condensed, theta: Theta, n_f: int) -> Sizes:
     units = np.ascontiguousarray(G[:, hard] / np.where(steps > 0, steps, 1.0)[:, hard, None])
     inverse, shift = inverse_factors(H)
     stiffness = kernels.row_sums(H).max(-1, initial=0.0)
-    rows = steps, hard, box, bounds, units
-    return Sizes(inverse, shift, stiffness, *condensed.sums, *rows, condensed.spans)
+    return Sizes(inverse, shift, stiffness, steps, hard, box, bounds, units)
 
 
 def inverse_factors(
