@@ -52,8 +52,7 @@ def test_moving_keeps_every_field(plant):
 
 
 def test_gymnasium_finds_nothing_to_complain_about(plant):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         # With soft bounds the observation space is unbounded, about which Gymnasium warns.
         warnings.filterwarnings("ignore", ".*(minimum|maximum) value is -?infinity")
         check_env(LinearSystemGymEnv(plant), skip_render_check=True)
@@ -61,8 +60,7 @@ def test_gymnasium_finds_nothing_to_complain_about(plant):
 
 def test_importing_again_does_not_register_again():
     spec = gymnasium.registry[ID]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         importlib.reload(torch_qpmpc.envs)
     assert gymnasium.registry[ID] is spec
 

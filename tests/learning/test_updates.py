@@ -188,7 +188,6 @@ def test_a_gradient_step_with_its_proximal_step_is_the_papers():
     twin = copy.deepcopy(mpc)
     make_update("sgd", mpc, deviation)[0](transitions(), None)
     loss_of(twin, td_error_clip=1.0)(transitions())["loss_value"].backward()
-    assert twin.C.grad is not None
     start, gradient = twin.C.detach().numpy(), twin.C.grad.numpy()
     step = cp.Variable(start.shape)
     penalty = cp.sum(cp.abs(cp.multiply(deviation.C_mask, start + step - deviation.C_0)))

@@ -84,7 +84,6 @@ def dense(mpc: QPMPC, s: Tensor, held: list[int]) -> tuple[float, np.ndarray]:
     rows += [z[u[k]] == z[u[k - 1]] for k in held]
     problem = cvxpy.Problem(cvxpy.Minimize(cost), rows)
     problem.solve(solver="CLARABEL", tol_gap_rel=1e-12, tol_gap_abs=1e-12, tol_feas=1e-12)
-    assert z.value is not None
     return np.asarray(cost.value).item(), z.value[u]
 
 

@@ -256,7 +256,6 @@ def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
     )
     mpc.value(random_states(6)).sum().backward()
     for name, parameter in mpc.named_parameters():
-        assert parameter.grad is not None
         assert parameter.grad.isfinite().all(), name
 
 
@@ -358,7 +357,6 @@ def test_released_entries_can_change():
     step(mpc, rate=0.01)
     assert (mpc.C[outside] != 0).any()
     mpc.value(s).sum().backward()
-    assert mpc.q.grad is not None
     assert (mpc.q.grad[:3] - mpc.q.grad[3:6]).abs().max() > 1e-3
     with pytest.raises(QPError, match="structure: got 'free', expected 'tied', which has"):
         mpc.model()
@@ -553,8 +551,7 @@ def test_predict_takes_any_array_of_numbers(kind):
     s = np.array([[1.0], [2.0], [-3.0]])
     for given in (s[::-1].astype(kind)[::-1], s.astype(kind)):
         given.flags.writeable = False
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             np.testing.assert_allclose(mpc.predict(given), mpc.predict(s), rtol=1e-6)
     with pytest.raises(QPError, match=r"observation: got ndarray, expected real numbers of shape"):
         mpc.predict(s + 1j)

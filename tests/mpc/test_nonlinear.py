@@ -127,12 +127,10 @@ def test_a_converged_plan_is_a_local_minimum_of_the_simulated_cost(priced):
     solution = mpc.solve(s)
     assert isinstance(solution, PlanSolution)
     assert solution.converged.all()
-    assert solution.strict is not None
     assert solution.strict.all()
     assert solution.defect.max() < 1e-6
     assert solution.residual.max() < 1e-6
     qp, search = mpc.quadratic_program(), mpc.sequential
-    assert search is not None
 
     def cost(u: Tensor) -> Tensor:
         z, costs = search.simulated(s, u)
@@ -213,8 +211,7 @@ def test_a_saddle_says_that_the_plan_has_no_gradient():
     assert gradient[1] != 0
     assert gradient.isfinite().all()
     mpc.on_failure = "mask"
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         mpc.policy(s)
 
 
@@ -256,7 +253,6 @@ def test_plans_and_gradients_do_not_depend_on_the_units(units, hard):
         solution = mpc.solve(p)
         assert isinstance(solution, PlanSolution)
         assert solution.converged.all()
-        assert solution.strict is not None
         assert solution.strict.all()
         (slope,) = torch.autograd.grad(mpc.policy(p).sum(), p)
         return solution.value / cost, solution.plan / u_unit, slope * x_unit / u_unit
@@ -457,7 +453,6 @@ def test_a_state_of_nan_has_no_plan_and_no_part_in_gradients(dynamics):
     found, want = (torch.autograd.grad(x.value[0], inputs) for x in (solution, alone))
     assert_close(found, want)
     physics, state = made(on_failure="mask"), torch.zeros(2, 2).double()
-    assert physics.sequential is not None
     for own, part, start in ((mpc, mpc, s.double()), (physics, physics.sequential, state)):
         for x in part.parameters():
             x.data.fill_(torch.nan)
