@@ -325,18 +325,10 @@ def test_the_log_adds_up_all_solves_of_its_block():
 
 
 def test_the_log_reports_the_metrics_of_training():
-    log = qm.SolveLog(
-        solves=4, unsolved=1, fallback=2, recalled=3, iterations=10, residual=1e-8, seconds=0.5
-    )
-    assert log.metrics() == {
-        "qp/solves": 4,
-        "qp/unsolved": 1,
-        "qp/fallback": 2,
-        "qp/recalled": 3,
-        "qp/iterations": 2.5,
-        "qp/residual": 1e-8,
-        "time/qp": 0.5,
-    }
+    counts = {"solves": 4, "unsolved": 1, "fallback": 2, "recalled": 3, "residual": 1e-8}
+    log = qm.SolveLog(**counts, iterations=10, seconds=0.5)
+    expected = {f"qp/{name}": x for name, x in counts.items()}
+    assert log.metrics() == expected | {"qp/iterations": 2.5, "time/qp": 0.5}
     assert qm.SolveLog().metrics()["qp/iterations"] == 0
 
 
