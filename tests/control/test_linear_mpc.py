@@ -1,7 +1,5 @@
 """`LinearMPC` beside the same problem in CVXPY, its set-points, and messages."""
 
-import copy
-import pickle
 from types import SimpleNamespace
 
 import cvxpy
@@ -127,15 +125,6 @@ def test_an_mpc_has_a_plan_and_is_none():
     assert mpc.plan.scheme.constants == {mpc.plan.n_p - 1: 1.0}
     assert mpc.options["learn"] == {"H": True}
     assert repr(mpc) == "LinearMPC(y1 by u1; horizon 3; Q [1.0]; dR [0.1]; learned H)"
-
-
-def test_copies_keep_the_design():
-    mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1)
-    for twin in (pickle.loads(pickle.dumps(mpc)), copy.deepcopy(mpc)):
-        assert twin.design.places == mpc.design.places
-        p = twin.arrange([1.0], twin.target([0.5]))
-        assert torch.equal(twin.plan.policy(p), mpc.plan.policy(p))
-    mpc.plan.reset_parameters()
 
 
 def test_p_takes_batches_and_is_relative_to_the_last_target():

@@ -247,10 +247,7 @@ def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):
     ({"min_on": 1.5}, "min_on: got 1.5"),
     ({"min_off": 0}, "min_off: got 0"),
     ({"start_cost": -1.0}, "start_cost: got -1.0, expected a number >= 0, or 1 of them"),
-    (
-        {"action_levels": None, "min_on": 2},
-        "min_on: got 2, expected action_levels or u_levels",
-    ),
+    ({"action_levels": None, "min_on": 2}, "min_on: got 2, expected action_levels or u_levels"),
     ({"max_nodes": 0}, "max_nodes: got 0"),
 )
 def test_wrong_levels_are_errors(options):
