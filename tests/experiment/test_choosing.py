@@ -15,14 +15,7 @@ from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.choosing import (
-    LINEAR,
-    NONLINEAR,
-    REGULATOR,
-    STARTS,
-    candidates,
-    choose,
-)
+from torch_qpmpc.experiment.choosing import LINEAR, NONLINEAR, REGULATOR, STARTS, candidates, choose
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
 from torch_qpmpc.experiment.start import OBSERVER, collect_log

@@ -13,14 +13,7 @@ import torch_qpmpc as qm
 from torch_qpmpc.identification import subspace
 from torch_qpmpc.identification.identification import Identified
 from torch_qpmpc.identification.innovations import Innovations
-from torch_qpmpc.identification.likelihood import (
-    Noisy,
-    Signals,
-    em,
-    groups_of,
-    likeliest,
-    smooth,
-)
+from torch_qpmpc.identification.likelihood import Noisy, Signals, em, groups_of, likeliest, smooth
 
 
 def tank(rows: int, hold: int, seed: int, start: float = 0.0, noise: float = 0.05) -> dict:
