@@ -14,7 +14,6 @@ def example(name: str) -> Any:
     """Return the module of docs/examples/NAME.py; ``task=NAME`` is a choice afterwards."""
     spec = importlib.util.spec_from_file_location(f"example_{name}", FOLDER / f"{name}.py")
     assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)

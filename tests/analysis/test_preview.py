@@ -12,21 +12,10 @@ from tests.figures import image_of, rendered
 from tests.problems import drawn_mpc, model_form, normal, predict
 from tests.refused import refused
 from torch_qpmpc import QPMPC, DeviationPenalty
+from torch_qpmpc.analysis import structure
 from torch_qpmpc.analysis.plots import canonical_figure
 from torch_qpmpc.analysis.policy import local_gain
 from torch_qpmpc.analysis.report import read
-from torch_qpmpc.analysis.structure import (
-    PredictionForm,
-    canonical_matrix,
-    causality_defect,
-    distance_by_band,
-    nearest_model,
-    one_step_error,
-    prediction_form,
-    predictions,
-    stage_models,
-    toeplitz_defect,
-)
 from torch_qpmpc.mpc.layout import Layout, band_distance, banded_matrix
 from torch_qpmpc.mpc.riccati import stage_weight
 
@@ -53,7 +42,7 @@ def step(p: Tensor, U: Tensor, A: Tensor = A, B: Tensor = B, E: Tensor = E) -> T
     return torch.stack(x[-N:])
 
 
-def model() -> PredictionForm:
+def model() -> structure.PredictionForm:
     return model_form(A, B, N, OFFSET, E)
 
 
@@ -75,22 +64,24 @@ def test_predictions_are_those_of_stepping_the_model(stages):
 def test_solutions_of_the_qp_are_predicted():
     mpc, p = scheme(), normal(6, LAYOUT.n_p)
     states, actions = mpc.predicted(mpc.solve(p).z.detach())
-    assert_close(predict(predictions(mpc), p, actions), states[:, 1:], rtol=1e-6, atol=1e-6)
+    assert_close(
+        predict(structure.predictions(mpc), p, actions), states[:, 1:], rtol=1e-6, atol=1e-6
+    )
 
 
 def test_a_scheme_in_any_gauge_is_a_scheme():
     C_0, T = banded_matrix(A, B, N, E), normal(N * N_X, N * N_X, seed=6)
-    form = prediction_form(T @ C_0, N_X, N_U, -T @ OFFSET.repeat(N), N_D)
+    form = structure.prediction_form(T @ C_0, N_X, N_U, -T @ OFFSET.repeat(N), N_D)
     for part in ("Phi", "Gamma", "phi"):
         assert_close(getattr(form, part), getattr(model(), part), rtol=0, atol=1e-10)
-    found, stages = nearest_model(form), stage_models(form)
+    found, stages = structure.nearest_model(form), structure.stage_models(form)
     for name, expected in (("A", A), ("B", B), ("E", E), ("offset", OFFSET)):
         assert_close(getattr(found, name), expected, rtol=0, atol=1e-9)
         each = getattr(stages, name)
         assert_close(each, expected.expand_as(each), rtol=0, atol=1e-9)
     assert max(found.residual, stages.residual.max()) < 1e-9
-    assert max(causality_defect(form), toeplitz_defect(form)) < 1e-10
-    C, b = canonical_matrix(form)
+    assert max(structure.causality_defect(form), structure.toeplitz_defect(form)) < 1e-10
+    C, b = structure.canonical_matrix(form)
     assert_close(C, C_0, rtol=0, atol=1e-9)
     assert_close(b, -OFFSET.repeat(N), rtol=0, atol=1e-9)
 
@@ -99,18 +90,18 @@ def test_a_scheme_in_any_gauge_is_a_scheme():
 
 
 def test_errors_of_the_model():
-    found = nearest_model(predictions(scheme()))
+    found = structure.nearest_model(structure.predictions(scheme()))
     wrong = (A + 0.1 * normal(*A.shape), B + 0.1 * normal(*B.shape, seed=8), E + 0.1)
     differences = [(x - y).flatten() for x, y in zip(wrong, (A, B, E), strict=True)]
     expected = torch.cat(differences).norm()
-    assert_close(one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
+    assert_close(structure.one_step_error(found, *wrong[:2], OFFSET, E=wrong[2]), expected)
     s, a, d = normal(50, N_X), normal(50, N_U, seed=1), normal(50, N_D, seed=2)
     error = s @ (wrong[0] - A).mT + a @ (wrong[1] - B).mT + d @ (wrong[2] - E).mT
     v = torch.cat((s, a, d, torch.ones(50, 1)), -1)
     moment = v.mT @ v / 50
     expected = error.square().sum(-1).mean().sqrt()
-    assert_close(one_step_error(found, *wrong[:2], OFFSET, moment, wrong[2]), expected)
-    assert_close(one_step_error(found, A, B, E=E), OFFSET.norm())
+    assert_close(structure.one_step_error(found, *wrong[:2], OFFSET, moment, wrong[2]), expected)
+    assert_close(structure.one_step_error(found, A, B, E=E), OFFSET.norm())
 
 
 def test_the_gain_is_the_slope_of_the_policy_in_all_that_is_known():
@@ -161,7 +152,7 @@ def test_the_band_of_a_preview():
     assert torch.equal(DeviationPenalty(mpc, **weights).C_mask, expected.double())
     with torch.no_grad():
         mpc.C += moved
-    found = distance_by_band(mpc)
+    found = structure.distance_by_band(mpc)
     for name, weight in (("on", o), ("above", a), ("below", b)):
         where = expected == weight
         assert found[name] == moved[where].abs().sum()
@@ -187,14 +178,14 @@ def test_figures_are_drawn_and_labelled():
 
 @refused(
     (
-        lambda: prediction_form(torch.zeros(10, 32), N_X, N_U, None, N_D),
+        lambda: structure.prediction_form(torch.zeros(10, 32), N_X, N_U, None, N_D),
         r"C: got shape \(10, 32\), expected .* with n_x = 2, n_u = 1, n_p = 14",
     ),
     (lambda: read(scheme(), (A[:, :1], B)), r"true_model's A: got shape \(2, 1\), expected shape"),
     (lambda: read(scheme(), (A, B, OFFSET, E[:, :1])), r"true_model's E: got shape \(2, 1\)"),
     (lambda: read(scheme(), at=torch.zeros(2)), r"at: got shape \(2,\), expected shape \(14,\)"),
     (
-        lambda: one_step_error(nearest_model(model()), A, B, E=E[:, :1]),
+        lambda: structure.one_step_error(structure.nearest_model(model()), A, B, E=E[:, :1]),
         r"E: got shape \(2, 1\), expected shape \(2, 2\)",
     ),
 )

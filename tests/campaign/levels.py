@@ -46,7 +46,6 @@ class Mixed(NamedTuple):
 def mixed(mpc: qm.QPMPC, s: torch.Tensor) -> Mixed:
     """Return V(s) as a mixed-integer program: x = [z; violations; levels; starts]."""
     levels = mpc.levels
-    assert levels is not None
     H, q, c, C, b, G, lb, ub, w = (x.detach().numpy() for x in mpc.quadratic_program().tensors())
     soft = np.flatnonzero(np.isfinite(w))
     (m, S), L = levels.rows.shape, levels.values.shape[1]
@@ -212,7 +211,6 @@ def times(designs: int, states: int, by_scip: int) -> None:
         weights = {"stage_weight": [1.0, 0.1, 0.05], "action_levels": [(0.0, 1.0)]}
         mpc = qm.QPMPC.from_model(A, B, N, **weights, solver="daqp", on_failure="mask")
         policy, qp = qm.CompiledPolicy(mpc), mpc.quadratic_program()
-        assert mpc.levels is not None
         plan = partial(mpc.levels.plan, mpc.at_rest(), runs=np.zeros(1, np.int64), hint=None)
         for k, p in enumerate(rng.normal(size=(states, 2)) - 1):
             s = torch.from_numpy(p)

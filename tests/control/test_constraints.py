@@ -57,7 +57,6 @@ def planned(x: np.ndarray, r: np.ndarray, constraints: Any, ends: Any) -> np.nda
     h, q = np.append(h, np.zeros(soft.sum())), np.append(2 * q, prices[soft])
     side = np.append(np.ones(n), np.full(soft.sum(), 1e3))
     z = qpsolvers.solve_qp(H, q, G, h, lb=-side, ub=side, solver="quadprog")
-    assert z is not None
     return z[:2]
 
 
@@ -91,7 +90,6 @@ def test_outputs_settle_at_the_steady_state_that_they_leave_nearest_to_the_set_p
     G = np.vstack((np.append(of_u, 0), np.append(y_m @ gain + u_m, -1)))
     h, side = np.array([top, high - y_m @ gain @ load]), np.array([1.0, 1.0, 1e3])
     z = qpsolvers.solve_qp(P, q, G, h, lb=-side * [1, 1, 0], ub=side, solver="quadprog")
-    assert z is not None
     assert np.abs(u - z[:2]).max() < 1e-5
     assert "constraints of " in controller.review(r).faults[0].remedy
 

@@ -191,10 +191,7 @@ def test_what_is_no_better_leaves_the_controller_as_it_was():
     assert controller.mpc is mpc
 
 
-@refused(
-    ({"members": 0}, "members: got 0"),
-    ({"seed": -1}, "seed: got -1"),
-)
+@refused(({"members": 0}, "members: got 0"), ({"seed": -1}, "seed: got -1"))
 def test_improve_refuses(change):
     made("bounds").improve(logged(), **change)
 

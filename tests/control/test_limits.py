@@ -57,7 +57,6 @@ def test_every_stage_of_a_plan_keeps_its_own_bound(options):
     controller, caps = plant(**options), np.array([0.9, 0.9, 0.4, 1.5, 0.2, 0.2, 0.7, 0.1, 0.1])
     controller.step([0.0, 0.0], [4.0, 0.0], known=rows(-9.0, caps))
     mpc = controller.mpc
-    assert controller.target is not None
     u = controller.target.u[0] + mpc.plan.predicted(mpc.plan.solve(controller.p).z)[1][:, 0]
     assert (u.numpy() <= caps[:N] + 1e-7).all()
     assert np.isclose(u.numpy(), caps[:N], atol=1e-6).sum() >= 3, "bounds decide"

@@ -1,7 +1,5 @@
 """`LinearMPC` beside the same problem in CVXPY, its set-points, and messages."""
 
-import copy
-import pickle
 from types import SimpleNamespace
 
 import cvxpy
@@ -48,7 +46,6 @@ def reference(x, targets, known, u_last, held=(), N=8):
             cvxpy.Problem(cvxpy.Minimize(cost), rows).solve(
                 solver="CLARABEL", tol_gap_rel=1e-11, tol_feas=1e-11
             )
-            assert plan.value is not None
             return plan.value[0]
         du = plan[k] - last
         cost += 2 * cvxpy.square(y[0] - targets[k].y[0]) + cvxpy.square(y[1] - targets[k].y[1])
@@ -130,15 +127,6 @@ def test_an_mpc_has_a_plan_and_is_none():
     assert repr(mpc) == "LinearMPC(y1 by u1; horizon 3; Q [1.0]; dR [0.1]; learned H)"
 
 
-def test_copies_keep_the_design():
-    mpc = qm.LinearMPC(SCALAR, 3, Q=1.0, dR=0.1)
-    for twin in (pickle.loads(pickle.dumps(mpc)), copy.deepcopy(mpc)):
-        assert twin.design.places == mpc.design.places
-        p = twin.arrange([1.0], twin.target([0.5]))
-        assert torch.equal(twin.plan.policy(p), mpc.plan.policy(p))
-    mpc.plan.reset_parameters()
-
-
 def test_p_takes_batches_and_is_relative_to_the_last_target():
     mpc = qm.LinearMPC((A, B, C), 8, E=E, references="preview", **NAMES, **DESIGN)
     r = np.linspace(0, 0.1, 9)[:, None] * np.ones((5, 1, 2))
@@ -217,7 +205,6 @@ def test_the_target_has_a_gradient(inputs):
     assert torch.autograd.gradcheck(lambda *point: tuple(mpc.target(*point)), point)
     out_of_reach = torch.tensor([90.0], dtype=torch.float64, requires_grad=True)
     mpc.target(out_of_reach).y.sum().backward()
-    assert out_of_reach.grad is not None
     assert out_of_reach.grad.abs().max() < 1e-9
     assert not mpc.target([1.0]).u.requires_grad
 

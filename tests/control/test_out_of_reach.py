@@ -43,14 +43,12 @@ def best(x: np.ndarray, u_last: np.ndarray, r: np.ndarray, d: np.ndarray) -> np.
     q = 2 * (G.T * Q @ off - D.T * dR @ before)
     ones = np.ones(2 * N)
     u = qpsolvers.solve_qp((P + P.T) / 2, q, lb=-ones, ub=ones, solver="quadprog")
-    assert u is not None
     return u[:2]
 
 
 def estimated(controller: qm.Controller, d: float) -> np.ndarray:
     """Return the state that the last step's plan began with, from the prediction after it."""
     observer, e = controller.observer, controller._memory.e
-    assert e is not None
     still = observer.predicted(np.zeros_like(e), controller.u, np.array([d]))
     return np.linalg.solve(observer.F, e - still)[: len(A)]
 
@@ -124,7 +122,6 @@ def test_inputs_with_a_weight_are_held_about_the_target_of_their_stage():
     for k in range(120):
         u = controller.step(C @ x, [0.3, 0.2], known=d[k : k + 21])
         x = A @ x + B @ u + E @ d[k]
-    assert controller.target is not None
     assert controller.target.u.shape == (21, 2)
     assert np.abs(C @ x - [0.3, 0.2]).max() < 0.02
 

@@ -38,7 +38,6 @@ def test_a_loaded_controller_goes_on_with_the_same_inputs(tmp_path, options):
     us = inputs(controller)
     for own in (twin, *copies):
         assert np.array_equal(inputs(own), us)
-    assert twin._memory.known is not None
     assert twin._memory.known.tolist() == [0.3, 0.19]
     assert twin.simulate(steps=1).u_last.tolist() == [0.1]
     assert twin.mpc.design.plant.label("level") == "level [m]"

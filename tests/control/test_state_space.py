@@ -91,7 +91,6 @@ def test_the_state_space_of_an_identification_has_its_predictions():
         read_model(found, E=[1.0])
     seen = model.estimates(y.numpy(), u.numpy(), d.numpy())[:-1]
     x = seen @ model.A.T + model.inputs(u.numpy(), d.numpy())
-    assert plant.visited is not None
     assert np.allclose(plant.visited[0], x.mean(0))
     assert np.allclose(plant.visited[1], np.cov(x.T, bias=True))
     assert not read_model(found, prices=["rain"]).E.any(), "a price acts on no plant"

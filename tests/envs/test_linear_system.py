@@ -13,24 +13,18 @@ from torch import Tensor
 
 import torch_qpmpc.envs
 from tests.rollouts import network_policy
-from torch_qpmpc.envs import (
-    GrosZanonLTI,
-    LinearSystem,
-    LinearSystemEnv,
-    LinearSystemGymEnv,
-    PointMass,
-)
+from torch_qpmpc import envs
 
 PLANTS = {
-    "gaussian": PointMass("gaussian", noise_std=0.1),
-    "brownian": PointMass("brownian", noise_std=0.1),
-    "gros_zanon": GrosZanonLTI(),
+    "gaussian": envs.PointMass("gaussian", noise_std=0.1),
+    "brownian": envs.PointMass("brownian", noise_std=0.1),
+    "gros_zanon": envs.GrosZanonLTI(),
 }
 ID = "torch_qpmpc/PointMass-v0"
 
 
 @pytest.fixture(params=PLANTS)
-def plant(request: pytest.FixtureRequest) -> LinearSystem:
+def plant(request: pytest.FixtureRequest) -> envs.LinearSystem:
     return PLANTS[request.param]
 
 
@@ -52,23 +46,21 @@ def test_moving_keeps_every_field(plant):
 
 
 def test_gymnasium_finds_nothing_to_complain_about(plant):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         # With soft bounds the observation space is unbounded, about which Gymnasium warns.
         warnings.filterwarnings("ignore", ".*(minimum|maximum) value is -?infinity")
-        check_env(LinearSystemGymEnv(plant), skip_render_check=True)
+        check_env(envs.LinearSystemGymEnv(plant), skip_render_check=True)
 
 
 def test_importing_again_does_not_register_again():
     spec = gymnasium.registry[ID]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         importlib.reload(torch_qpmpc.envs)
     assert gymnasium.registry[ID] is spec
 
 
 def test_gymnasium_environment_follows_the_physics(plant):
-    env = gymnasium.wrappers.TimeLimit(LinearSystemGymEnv(plant), 50)
+    env = gymnasium.wrappers.TimeLimit(envs.LinearSystemGymEnv(plant), 50)
     rng, actions = np.random.default_rng(7), np.random.default_rng(8)
     observation, _ = env.reset(seed=7)
     s, ends = plant.starts(rng, 1)[0], []
@@ -91,7 +83,7 @@ def test_gymnasium_environment_follows_the_physics(plant):
 
 
 def test_torchrl_environment_follows_the_physics(plant):
-    env = LinearSystemEnv(plant, 5, 50, torch.float64, seed=11)
+    env = envs.LinearSystemEnv(plant, 5, 50, torch.float64, seed=11)
     data = env.rollout(50, network_policy(env))
     rng = torch.Generator().manual_seed(11)
     s = plant.starts(rng, 5)

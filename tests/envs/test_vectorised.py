@@ -12,26 +12,21 @@ from torchrl.envs import ObservationNorm, SerialEnv, TransformedEnv, check_env_s
 from tests.envs.test_kalman_filter import model
 from tests.rollouts import Staggered, collected, network_policy
 from tests.store import Store
-from torch_qpmpc.envs import (
-    GrosZanonLTI,
-    KalmanFilter,
-    LinearSystem,
-    LinearSystemEnv,
-    PlantEnv,
-    PointMass,
-)
+from torch_qpmpc import envs
 
 
 def observed(*arguments: Any, **options: Any) -> Any:
-    return TransformedEnv(PlantEnv(Store(), *arguments, **options), KalmanFilter(model(3, 2, 2)))
+    return TransformedEnv(
+        envs.PlantEnv(Store(), *arguments, **options), envs.KalmanFilter(model(3, 2, 2))
+    )
 
 
 ENVS = {
-    "gaussian": partial(LinearSystemEnv, PointMass("gaussian")),
-    "brownian": partial(LinearSystemEnv, PointMass("brownian")),
-    "gros_zanon": partial(LinearSystemEnv, GrosZanonLTI()),
-    "preview": partial(PlantEnv, Store()),
-    "no preview": partial(PlantEnv, Store(n_d=0)),
+    "gaussian": partial(envs.LinearSystemEnv, envs.PointMass("gaussian")),
+    "brownian": partial(envs.LinearSystemEnv, envs.PointMass("brownian")),
+    "gros_zanon": partial(envs.LinearSystemEnv, envs.GrosZanonLTI()),
+    "preview": partial(envs.PlantEnv, Store()),
+    "no preview": partial(envs.PlantEnv, Store(n_d=0)),
     "estimate": observed,
 }
 
@@ -70,8 +65,8 @@ def test_rollouts_depend_on_the_seed_only(make):
 
 
 def test_exploration_after_the_same_seed_is_not_the_noise():
-    class Own(PointMass):
-        stream = LinearSystem.stream
+    class Own(envs.PointMass):
+        stream = envs.LinearSystem.stream
 
     own, torchs = Own().vectorised(4, 6, seed=5).rng, torch.Generator().manual_seed(5)
     draws = [torch.rand(5000, generator=rng, dtype=torch.float64) for rng in (own, torchs)]
@@ -103,20 +98,20 @@ def test_saved_generator_continues_the_stream(make):
         assert torch.equal(rollout(copy.deepcopy(one)), expected)
 
 
-class StaggeredSystem(Staggered, LinearSystemEnv):
+class StaggeredSystem(Staggered, envs.LinearSystemEnv):
     """Episodes that start at different steps, so that every later reset is partial."""
 
 
-class StaggeredPlant(Staggered, PlantEnv):
+class StaggeredPlant(Staggered, envs.PlantEnv):
     """The same of a plant with previews."""
 
 
 @pytest.mark.parametrize(
     ("kind", "plant", "begun"),
     [
-        (StaggeredSystem, PointMass("gaussian", noise_std=0.1), "noise"),
-        (StaggeredSystem, PointMass("brownian", noise_std=0.1), "noise"),
-        (StaggeredSystem, GrosZanonLTI(), "noise"),
+        (StaggeredSystem, envs.PointMass("gaussian", noise_std=0.1), "noise"),
+        (StaggeredSystem, envs.PointMass("brownian", noise_std=0.1), "noise"),
+        (StaggeredSystem, envs.GrosZanonLTI(), "noise"),
         (StaggeredPlant, Store(horizon=3), "pump"),
     ],
 )

@@ -8,13 +8,7 @@ import torch
 from tests.runs import SMALL, choices, make_config
 from torch_qpmpc import QPActorValueOperator, SolveLog
 from torch_qpmpc.envs.closed_loop import closed_loop
-from torch_qpmpc.experiment.algorithms import (
-    evaluate,
-    make_collector,
-    make_learner,
-    make_operator,
-    make_penalties,
-)
+from torch_qpmpc.experiment import algorithms
 from torch_qpmpc.experiment.tasks import make_mpc, make_physics
 from torch_qpmpc.learning.operators import POLICY_ACTIVE_SET
 
@@ -29,7 +23,7 @@ def test_a_case_has_its_penalties_with_their_weights(constraint, others):
     own = [f"constraint.{other}" for other in others]
     cfg = make_config(f"constraint={constraint}", *SMALL, *own)
     mpc = make_mpc(cfg, make_physics(cfg))
-    penalties = make_penalties(cfg, mpc)
+    penalties = algorithms.make_penalties(cfg, mpc)
     deviation, si = penalties.deviation, penalties.si
     assert (deviation is not None) == (constraint in ("deviation", "combined", "identified"))
     assert (si is not None) == (constraint in ("si", "combined", "identified"))
@@ -58,7 +52,7 @@ def test_optimizer_has_two_rates_that_fall_linearly(name):
         "constraint.learn=[C,ub]",
     )
     mpc = make_mpc(cfg, make_physics(cfg))
-    learner = make_learner(cfg, QPActorValueOperator(mpc))
+    learner = algorithms.make_learner(cfg, QPActorValueOperator(mpc))
     optimizer, scheduler = learner.optimizer, learner.scheduler
     assert optimizer.defaults.get("betas") == ((0.5, 0.75) if name == "adam" else None)
     assert type(optimizer).__name__.lower() == name
@@ -85,7 +79,7 @@ def test_the_evaluation_has_a_seed_of_its_own(task):
 
     def costs(*overrides: str) -> torch.Tensor:
         cfg = make_config(f"task={task}", "task.eval_steps=3", *overrides)
-        return evaluate(cfg, policy, physics).costs
+        return algorithms.evaluate(cfg, policy, physics).costs
 
     assert not torch.equal(costs("eval_seed=4"), costs())
     assert torch.equal(costs("eval_seed=4"), costs("eval_seed=4", "seed=2"))
@@ -103,8 +97,8 @@ def test_a_collector_explores_about_the_policy_and_carries_active_sets(task, std
     cfg = make_config(*SMALL, *own, "num_envs=50", "steps_per_update=3")
     physics = make_physics(cfg)
     mpc = make_mpc(cfg, physics)
-    policy = make_operator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
-    collector: Any = make_collector(cfg, physics, policy)
+    policy = algorithms.make_operator(mpc).get_policy_operator(POLICY_ACTIVE_SET)
+    collector: Any = algorithms.make_collector(cfg, physics, policy)
     torch.manual_seed(0)
     with SolveLog() as log:
         batches = [batch.clone() for batch, _ in zip(collector, range(6), strict=False)]

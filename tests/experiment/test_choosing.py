@@ -15,14 +15,7 @@ from torch_qpmpc import QPMPC, QPError
 from torch_qpmpc.envs.closed_loop import closed_loop
 from torch_qpmpc.experiment import choosing
 from torch_qpmpc.experiment.algorithms import evaluate
-from torch_qpmpc.experiment.choosing import (
-    LINEAR,
-    NONLINEAR,
-    REGULATOR,
-    STARTS,
-    candidates,
-    choose,
-)
+from torch_qpmpc.experiment.choosing import LINEAR, NONLINEAR, REGULATOR, STARTS, candidates, choose
 from torch_qpmpc.experiment.rivals import ZERO_ACTION
 from torch_qpmpc.experiment.run_folder import CHECKPOINT
 from torch_qpmpc.experiment.start import OBSERVER, collect_log
@@ -68,7 +61,6 @@ def chosen(*overrides):
     cfg = make_config(*overrides)
     physics: Any = make_physics(cfg)
     start = choose(cfg, physics, collect_log(cfg, physics))
-    assert start.choice is not None
     return cfg, physics, start, start.choice
 
 
@@ -90,11 +82,9 @@ def test_the_candidates_have_the_stage_s_and_the_regulator_s_cost(register):
     }
     outputs, mpc = named[LINEAR], mpcs[LINEAR]
     assert outputs.order == 0
-    assert outputs.cost is not None
     assert_close(mpc.H_f.double(), outputs.cost.W[: mpc.n_x, : mpc.n_x], rtol=1e-6, atol=1e-6)
     start, mpc = named[REGULATOR], mpcs[REGULATOR]
     assert start.order > 1
-    assert start.cost is not None
     A, B = (torch.tensor(part) for part in start.model[:2])
     P = terminal_riccati(A, B, start.cost.W, mpc.gamma, mpc.layout)
     assert_close(mpc.H_f.double(), P, rtol=1e-6, atol=1e-6)
@@ -267,7 +257,6 @@ def test_a_run_estimates_a_hidden_state_and_resumes_with_the_start_that_it_has_c
     cfg, whole, cut = make_config(*DATA, *settings), tmp_path / "whole", tmp_path / "cut"
     run = trained(cfg, whole)
     plant: Any = run.physics
-    assert run.observer is not None
     assert plant.n_x == run.policy.n_x == run.summary["order"] == len(run.observer.A) >= 2
     assert run.summary["J_start"] < 25, "16 with both states known, 37 by feedback of the position"
     assert "constraint=mpc" in repr(run)

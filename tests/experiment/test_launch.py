@@ -34,7 +34,6 @@ def test_a_live_process_holds_the_lock_and_a_killed_one_does_not(tmp_path):
     command = [sys.executable, "-c", HOLD, str(tmp_path / LOCK)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         message = f"^folder: got {tmp_path}, in use by another process, .* with KEY.$"
         with pytest.raises(QPError, match=message), locked(tmp_path, "KEY"):

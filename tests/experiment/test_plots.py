@@ -10,13 +10,8 @@ from tests.figures import legend_of, make_mpc, rendered
 from tests.runs import make_config
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.envs.closed_loop import closed_loop
+from torch_qpmpc.experiment import plots
 from torch_qpmpc.experiment.evaluation import Evaluation
-from torch_qpmpc.experiment.plots import (
-    experience,
-    learned_episode_figure,
-    scale_costs,
-    summary_figure,
-)
 
 pytestmark = pytest.mark.layout
 
@@ -36,7 +31,7 @@ def found(mpc) -> Evaluation:
 
 def test_the_summary_has_the_curve_the_matrix_and_the_paths(mpc, found):
     updates, J = [0, 10, 20], [300.0, 120.0, 60.0]
-    figure = summary_figure(mpc, found, updates, J)
+    figure = plots.summary_figure(mpc, found, updates, J)
     learning, _, paths = (axes for axes in figure.axes if axes.get_ylabel() or axes.images)
     shown = [label.partition(",")[0] for label in legend_of(learning)]
     assert shown == ["learned", "start", "true model", "omniscient"]
@@ -45,11 +40,11 @@ def test_the_summary_has_the_curve_the_matrix_and_the_paths(mpc, found):
     assert len(legend_of(paths)) == 4
     assert (paths.get_xlabel(), paths.get_ylabel()) == ("x", "y")
     rendered(figure)
-    rendered(summary_figure(mpc, found, [0, 10], [300.0, math.nan]))  # one that diverged
+    rendered(plots.summary_figure(mpc, found, [0, 10], [300.0, math.nan]))  # one that diverged
 
 
 def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found):
-    figure = learned_episode_figure(mpc, found)
+    figure = plots.learned_episode_figure(mpc, found)
     labels = ["x", "y", "velocity in x", "velocity in y", "force in x", "force in y"]
     assert [axes.get_ylabel() for axes in figure.axes] == labels
     loop = found.loops["learned"]
@@ -60,15 +55,15 @@ def test_the_episode_has_the_loop_and_the_plans_of_every_half_horizon(mpc, found
 
 
 def test_experience_counts_the_log_and_the_warm_up():
-    assert experience(make_config()) == (192, 64)
+    assert plots.experience(make_config()) == (192, 64)
     log = ("start=data", "start.transitions=192")
-    assert experience(make_config(*log))[0] == 192 + 192
-    assert experience(make_config(*log, "start.file=log.pt"))[0] == 192
+    assert plots.experience(make_config(*log))[0] == 192 + 192
+    assert plots.experience(make_config(*log, "start.file=log.pt"))[0] == 192
 
 
 @pytest.mark.parametrize(("costs", "scale"), [([20.9, 24.0], "linear"), ([20.0, 60.0], "log")])
 def test_costs_that_hardly_differ_have_a_linear_scale(costs, scale):
     axes = Figure().subplots()
     axes.plot(costs)
-    scale_costs(axes)
+    plots.scale_costs(axes)
     assert axes.get_yscale() == scale

@@ -154,7 +154,6 @@ def test_a_checkpoint_of_another_run_or_layout_is_refused(stopped):
 )
 def test_a_part_that_does_not_fit_is_named(stopped, part, change):
     cfg, state = begun(stopped)
-    assert state is not None
     state[part].update(change)
     with pytest.raises(QPError, match=rf"^checkpoint: got '{part}' that does not fit \(.*version"):
         train.train(cfg, str(stopped), state)

@@ -113,7 +113,6 @@ def test_a_weight_is_of_the_observations_where_the_log_s_model_has_hidden_states
     scheme = given_scheme(cfg, plant.observed(Innovations(A, B, E, *rest)))
     weight = scheme.cost.stage_weight
     own = torch.tensor(cfg.task.stage_weight, dtype=torch.float64)
-    assert weight is not None
     assert torch.equal(weight[[0, 1, 2, 5]][:, [0, 1, 2, 5]], own)
     assert not weight[3:5].any()
     assert not weight[:, 3:5].any()
@@ -151,7 +150,6 @@ def test_a_task_without_a_weight_gets_the_cost_of_the_log(hessian):
 def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost():
     cfg = make_config(*PENDULUM, "task.terminal_weight=riccati", "task.gamma=0.9")
     _, start, mpc = start_of(cfg)
-    assert start.cost is not None
     A, B, _, offset = (torch.tensor(part) for part in start.model[:4])
     P = riccati_weight(A, B, start.cost.W, 0.9)
     assert_close(mpc.H_f.double(), P)
@@ -163,7 +161,6 @@ def test_a_terminal_weight_from_the_riccati_equation_is_that_of_the_fitted_cost(
 def test_the_order_and_the_fit_of_the_cost_are_shown():
     cfg = make_config(*PENDULUM, "start.transitions=1000")
     _, start, mpc = start_of(cfg)
-    assert start.cost is not None
     R2 = start.cost.R2
     assert f"stage cost fitted to the rewards: R2 {R2:.3f}" in str(start)
     assert start.summary == {"log_episodes_cut": 0, "order": mpc.n_x, "R2_cost": R2}
@@ -179,8 +176,6 @@ def test_episodes_that_blow_up_are_cut_and_counted():
     assert start.cut == 4 * 2
     assert str(start).startswith("Episodes of the log that blow up, and are cut there: 8\n")
     assert_close(start.model.A, shorter.model.A)
-    assert start.cost is not None
-    assert shorter.cost is not None
     assert_close(start.cost.W, shorter.cost.W)
 
 

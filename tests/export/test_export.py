@@ -31,7 +31,6 @@ def test_the_report_has_sizes_and_agreement(tmp_path):
     assert all(file.exists() for file in export.files)
     assert (export.n_p, export.n_u, export.rows, export.variables) == (4, 2, 60, 20)
     agreement = export.agreement
-    assert agreement is not None
     assert agreement.u < 1e-8
     assert agreement.value < 1e-8
     assert agreement.unsolved == 0
@@ -46,7 +45,6 @@ def test_the_report_has_sizes_and_agreement(tmp_path):
 @needs_compiler
 def test_float32_is_measured(tmp_path):
     export = export_c(tied(), tmp_path, dtype="float32", name="single")
-    assert export.agreement is not None
     assert 1e-8 < export.agreement.u < 1e-3
     assert "typedef float single_real;" in export.files[0].read_text()
     library = read(tmp_path, "single", "float32")
@@ -126,7 +124,6 @@ def test_a_large_qp_is_compared_at_fewer_states(tmp_path, monkeypatch):
     monkeypatch.setattr(comparison, "LARGE", 4)
     monkeypatch.setattr(comparison, "LEAST", 15)
     agreement = export_c(tied(), tmp_path).agreement
-    assert agreement is not None
     assert agreement.states == comparison.LEAST
     assert agreement.solved >= comparison.LEAST // 2
     assert agreement.u < 1e-8
@@ -342,7 +339,6 @@ def test_entries_with_one_value_only_keep_it_in_the_examples(tmp_path):
         assert abs(last - value).max() < 1e-12
         assert abs(tables.centre[-1] - value) < 1e-12
         agreement = export_c(mpc, tmp_path).agreement
-        assert agreement is not None
         assert agreement.solved > 30
 
 
@@ -353,7 +349,6 @@ def test_an_entry_without_an_effect_up_to_rounding_is_exported(tmp_path):
     mpc = QPMPC.from_model(A, B, 4, stage_weight=weight, action_bounds=([-1.0], [1.0]))
     assert abs(draw(make_tables(mpc), 100)[:, 1]).max() < 100
     agreement = export_c(mpc, tmp_path).agreement
-    assert agreement is not None
     assert agreement.u < 1e-6
 
 
@@ -366,7 +361,6 @@ def test_states_that_leave_nothing_but_the_open_loop_of_an_unstable_plant_are_ce
     horizon = 20 if pole < 2 else 12
     mpc = qm.LinearMPC(([[pole]], [[1.0]]), horizon, Q=1.0, R=0.1, u_bounds=(-1.0, 1.0)).plan
     agreement = export_c(mpc, tmp_path).agreement
-    assert agreement is not None
     assert (agreement.solved, agreement.unsolved) == (agreement.states, 0)
     assert 1e-10 < agreement.value < 1e-7
     assert len(make_tables(mpc).known.Y) == 0  # no row of rounding is an equation of p

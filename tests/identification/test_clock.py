@@ -53,8 +53,7 @@ def test_dates_may_begin_with_the_day(text, start, freq):
     frame = room().assign(t=clock(text, start, freq))
     dt = {"15min": 900, "h": 3600, "6h": 21600}[freq]
     options: Any = {**NAMES, "time": "t"}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         log = qm.read_log(frame, **options)
     assert (lengths(log), log.dt) == ([59], dt)
     days = {(x.day, x.month) for x in clock(None, start, freq)}
@@ -63,8 +62,7 @@ def test_dates_may_begin_with_the_day(text, start, freq):
     ambiguous = bool(said) if "%y" in text else ambiguous  # pandas guesses row by row
     first = text.startswith("%d")
     assert [f"day_first={first}" in x for x in said] == [True] * ambiguous
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert qm.read_log(frame, **options, day_first=first).dt == dt
 
 
@@ -133,8 +131,7 @@ def test_a_clock_means_what_makes_its_steps_even(text, dt, guess, start, tmp_pat
     times = pd.date_range(first, periods=600, freq=f"{dt}s")
     frame["t"] = spelled(times, text)
     frame.iloc[rows].to_csv(tmp_path / "a.csv", index=False)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         log = qm.read_log(tmp_path / "a.csv", **NAMES, time="t", day_first=True)
     said = [str(x.message) for x in caught]
     assert (lengths(log), log.dt, log.dt_unit) == ([299, 259], dt, "s"), log
@@ -163,8 +160,7 @@ def test_a_clock_means_what_makes_its_steps_even(text, dt, guess, start, tmp_pat
 def test_even_numbers_are_numbers(times):
     frame = room(600).assign(t=times).rename(columns={"t": "t [h]"})
     rows = np.r_[:300, 340:600]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         log = qm.read_log(frame.iloc[rows], **NAMES, time="t")
     assert (lengths(log), log.dt_unit) == ([299, 259], "h")
     assert log.dt == pytest.approx(times[1] - times[0], rel=1e-6)

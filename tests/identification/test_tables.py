@@ -283,8 +283,7 @@ def test_numbers_that_mark_missing_ones_are_named(number, rows):
     frame = room()
     frame.loc[list(range(5, 5 + rows)), "q"] = number
     frame.loc[9, "T_out"] = 1e4  # once: it may have been so
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         log = qm.read_log(frame, **NAMES)
     said = [f"q is {number:.6g} in {rows} rows, far from all others, which may mark missing"]
     assert [str(x.message)[: len(said[0]) + 13].split(", ", 1)[1] for x in caught] == said[:rows]
@@ -299,8 +298,7 @@ def test_a_few_numbers_that_are_far_from_all_others_are_named(rows, said):
         1e3 * rng.choice([-1, 1], rows) * (2 + np.arange(rows))
     )
     log = {"y": y, "u": rng.normal(size=200)}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         qm.read_log(log)
     named = f"In this log, y is far from all others in {rows} rows, such as "
     assert [str(x.message)[: len(named)] for x in caught] == [named] * said
@@ -364,8 +362,7 @@ def test_a_response_that_is_rare_is_no_error():
     u, y = np.zeros(400), 1e-3 * np.random.default_rng(0).normal(size=401)
     u[100] = 1.0
     y[101:115] += 0.8 ** np.arange(14)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         qm.read_log({"y": y, "u": u})
 
 

@@ -16,15 +16,7 @@ from tests.refused import refused
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.identification.identification import Identified, identify
 from torch_qpmpc.identification.log import Trajectory
-from torch_qpmpc.learning.closed_loop import (
-    SimulatedPlant,
-    _Loops,
-    ensemble,
-    growth,
-    one_more,
-    simulated_plant,
-    stage_cost,
-)
+from torch_qpmpc.learning import closed_loop
 
 
 @functools.cache
@@ -60,16 +52,16 @@ def found() -> Identified:
 def test_the_gradient_of_a_closed_loop_is_that_of_finite_differences(found):
     """It goes through the filter and the QP, and through loops with active and violated bounds."""
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=3)
+    plant = closed_loop.simulated_plant(found, closed_loop.stage_cost(mpc.scheme), 5, members=3)
 
     def cost() -> torch.Tensor:
-        taken = _Loops(plant, 6, 1).run(mpc, 12)
+        taken = closed_loop._Loops(plant, 6, 1).run(mpc, 12)
         at_bounds = (taken.actions.abs() > 0.4999).double().mean()
         assert 0.1 < at_bounds < 0.9
         assert (taken.known[..., 0] < -0.2).any()
         return taken.costs.mean()
 
-    mean = _Loops(plant, 6, 1).mean_cost(mpc, 12)
+    mean = closed_loop._Loops(plant, 6, 1).mean_cost(mpc, 12)
     torch.testing.assert_close(mean.detach(), cost(), rtol=1e-10, atol=0.0)
     mean.backward()
     for name, leaf in mpc.coordinates().items():
@@ -108,9 +100,9 @@ def test_loops_of_a_nonlinear_policy_have_their_gradient_and_improve():
     mpc = qm.QPMPC.of(2, 1, 3, **options)
 
     def cost() -> torch.Tensor:
-        return _Loops(plant, 4, 1).run(mpc, 6).costs.mean()
+        return closed_loop._Loops(plant, 4, 1).run(mpc, 6).costs.mean()
 
-    _Loops(plant, 4, 1).mean_cost(mpc, 6).backward()
+    closed_loop._Loops(plant, 4, 1).mean_cost(mpc, 6).backward()
     for name, leaf in mpc.coordinates().items():
         if leaf.grad is not None:
             direction = torch.ones_like(leaf).tril() if leaf.ndim > 1 else torch.ones_like(leaf)
@@ -125,7 +117,7 @@ def test_loops_of_a_nonlinear_policy_have_their_gradient_and_improve():
 def test_an_identified_plant_has_the_moments_of_its_model(found):
     """The first outputs and the later innovations have the model's covariances."""
     model, n = found.model, len(found.model.A)
-    plant = simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
+    plant = closed_loop.simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
     rng, zero = torch.Generator().manual_seed(0), torch.zeros(4000, 1).double()
     s = plant.starts(rng, 4000)
     first = model.C @ model.P0 @ model.C.T + model.S
@@ -157,7 +149,7 @@ def test_improve_lowers_the_cost_of_identified_loops(found):
 def test_some_models_train_and_the_others_decide(found):
     """A theta with which one of the others costs clearly more is not kept."""
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=4)
+    plant = closed_loop.simulated_plant(found, closed_loop.stage_cost(mpc.scheme), 5, members=4)
     assert plant.members == plant.unseen.members == 2
     assert not torch.equal(plant._own.A, plant.unseen._own.A)
     options: Any = {"updates": 2, "loops": 4, "steps": 10, "held_out": 64}
@@ -191,11 +183,11 @@ def test_a_twentieth_of_models_costs_more_than_the_prediction():
     """Whatever their number; models with which the old theta fails do not count."""
     draws = torch.randn(4000, 9, generator=torch.Generator().manual_seed(0)).double()
     for k in (2, 8):
-        above = [bool(x[8] > one_more(x[:k], 0.05)) for x in draws]
+        above = [bool(x[8] > closed_loop.one_more(x[:k], 0.05)) for x in draws]
         assert np.mean(above) == pytest.approx(0.05, abs=0.012)
     failed = torch.cat((draws[0], torch.tensor([-math.inf])))
-    assert one_more(failed, 0.05) == one_more(draws[0], 0.05)
-    assert math.isnan(one_more(failed[8:], 0.05))
+    assert closed_loop.one_more(failed, 0.05) == closed_loop.one_more(draws[0], 0.05)
+    assert math.isnan(closed_loop.one_more(failed[8:], 0.05))
 
 
 class Drifts:
@@ -238,8 +230,8 @@ def test_loops_that_no_action_holds_fail_and_decide_nothing(found):
     """They end as NaN, soon, in place of numbers without end; both thetas fail alike."""
     mpc, log = controller(found, on_failure="mask"), found.log.trajectories
     model = found.model._replace(A=1.4 * found.model.A)
-    plant = SimulatedPlant([model], model, log, stage_cost(mpc.scheme), 5)
-    taken = _Loops(plant, 16, 0).run(mpc, 80)
+    plant = closed_loop.SimulatedPlant([model], model, log, closed_loop.stage_cost(mpc.scheme), 5)
+    taken = closed_loop._Loops(plant, 16, 0).run(mpc, 80)
     assert taken.costs[-1].isnan().sum() > 8
     assert taken.states.nan_to_num().abs().max() < 1e9
     report = qm.improve(mpc, plant, updates=2, loops=4, steps=20, held_out=16)
@@ -250,12 +242,12 @@ def test_loops_that_no_action_holds_fail_and_decide_nothing(found):
 @pytest.mark.parametrize("seed", range(2))
 def test_pieces_of_a_single_trajectory_make_an_ensemble(seed):
     """Its models differ about as much as those of logs of their own do."""
-    models = ensemble(logged(1, 600), 8, seed)
+    models = closed_loop.ensemble(logged(1, 600), 8, seed)
     poles = np.array([np.sort(np.abs(np.linalg.eigvals(model.A))) for model in models])
     assert len(models) == 8
     assert (np.abs(poles - np.hypot(0.9, 0.3)) < 0.1).all()
     assert 1e-4 < poles[:, 0].std() < 0.05
-    assert len(ensemble(logged(1, 15), 8, seed)) == 8  # of whatever pieces
+    assert len(closed_loop.ensemble(logged(1, 15), 8, seed)) == 8  # of whatever pieces
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -266,7 +258,7 @@ def test_an_ensemble_leaves_out_draws_of_trajectories_too_short_for_a_fit(found,
     y[2:-2] = torch.nan
     short = Trajectory(y, u, d) if gaps else Trajectory(*(x[:2] for x in (long[0].y, u[:1], d[:1])))
     log = dataclasses.replace(found.log, trajectories=[*long, *[short] * 14])
-    assert len(ensemble(dataclasses.replace(found, log=log), 12, seed)) == 12
+    assert len(closed_loop.ensemble(dataclasses.replace(found, log=log), 12, seed)) == 12
 
 
 def test_what_is_no_better_or_stopped_leaves_theta_as_it_was():
@@ -297,8 +289,8 @@ def test_what_is_no_better_or_stopped_leaves_theta_as_it_was():
 
 def test_loops_go_on_where_the_last_window_ended(found):
     mpc = controller(found)
-    plant = simulated_plant(found, stage_cost(mpc.scheme), 5, members=1)
-    whole, parts = _Loops(plant, 4, 3), _Loops(plant, 4, 3)
+    plant = closed_loop.simulated_plant(found, closed_loop.stage_cost(mpc.scheme), 5, members=1)
+    whole, parts = closed_loop._Loops(plant, 4, 3), closed_loop._Loops(plant, 4, 3)
     expected = whole.run(mpc, 10).costs
     got = torch.cat([parts.run(mpc, 5).costs for _ in range(2)])
     torch.testing.assert_close(got, expected)
@@ -316,7 +308,9 @@ def test_the_stage_cost_is_the_schemes_with_the_price_of_violations():
         state_slack=10.0,
         q=[1.0, 0.0] * 3 + [0.0],
     )
-    cost = stage_cost(scheme)(torch.tensor([[3.0]]).double(), torch.tensor([[0.5]]).double())
+    cost = closed_loop.stage_cost(scheme)(
+        torch.tensor([[3.0]]).double(), torch.tensor([[0.5]]).double()
+    )
     assert cost.item() == pytest.approx(9.0 + 0.5 + 3.0 + 20.0)
 
 
@@ -366,7 +360,7 @@ def test_known_signals_go_on_as_in_the_log(learn):
     found = identify(log, order=0)
     options = {"stage_weight": torch.tensor([3.0, 0.1]), "structure": "tied", "gamma": 1.0}
     mpc = qm.QPMPC.of(**{**found.arguments, "horizon": 3}, **options, learn=learn, solver="daqp")
-    plant = simulated_plant(found, stage_cost(mpc.scheme), 3, members=2)
+    plant = closed_loop.simulated_plant(found, closed_loop.stage_cost(mpc.scheme), 3, members=2)
     draw, d = torch.Generator().manual_seed(0), torch.cat([x.d for x in log.trajectories])[:, 0]
     s, u = plant.starts(draw, 50), torch.zeros(50, 1).double()
     for _ in range(70):
@@ -393,7 +387,7 @@ def test_noise_that_grows_with_the_action_is_identified(seed):
     v = rng.uniform(-1, 1, (1500, 3)) * [1.0, 20.0, 0.5]
     std = np.sqrt(0.5 + 8.0 * v[:, 2] ** 2)
     e = np.stack((std * heavy(rng, 1500), 1e3 * rng.normal(size=1500), rng.uniform(-1, 1, 1500)), 1)
-    c = growth(e, v)
+    c = closed_loop.growth(e, v)
     mean = (std**2).mean()
     np.testing.assert_allclose(c[0, [0, 3]] * mean, [0.5, 8.0], rtol=0.35)
     assert (c[0, [1, 2]] * (v[:, :2] ** 2).mean(0)).max() < 0.1
@@ -410,7 +404,7 @@ def test_simulated_noise_grows_as_the_logs(sensor):
             x.append(0.8 * x[-1] + u[k] * (1 + rng.normal(size=1)) + 0.02 * rng.normal(size=1))
         logs.append({"y": np.array(x) + sensor * rng.normal(size=(61, 1)), "u": u})
     found = identify(logs, order=int(sensor > 0))
-    plant = simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
+    plant = closed_loop.simulated_plant(found, lambda p, u: p.sum(-1), 5, members=1)
     draw = torch.Generator().manual_seed(0)
     s = plant.starts(draw, 4000)
     for level, std in ((1.0, 1.0 / 0.6), (0.5, 0.5 / 0.6), (0.0, 0.02 / 0.6)):

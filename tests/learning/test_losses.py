@@ -14,18 +14,9 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
+from torchrl import objectives
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor, QValueActor, TanhNormal, ValueOperator
-from torchrl.objectives import (
-    ClipPPOLoss,
-    CQLLoss,
-    DDPGLoss,
-    DQNLoss,
-    IQLLoss,
-    LossModule,
-    SACLoss,
-    TD3Loss,
-)
 
 from tests.problems import random_mpc, random_states
 from torch_qpmpc import QPMPC, QPActorValueOperator, QPQLearningLoss, SolverError
@@ -125,41 +116,45 @@ def grid_critic() -> Any:
 
 
 #: Losses, named by the role of the QP.
-LOSSES: dict[str, Callable[[], LossModule]] = {
-    "critic of DDPG": lambda: DDPGLoss(network_policy(), critic(), delay_actor=True),
-    "critics of TD3": lambda: TD3Loss(network_policy(), critics(), bounds=BOUNDS),
-    "critics of CQL": lambda: CQLLoss(network_gaussian(), critics()),
-    "critics and value of IQL": lambda: IQLLoss(network_gaussian(), critics(), value()),
-    "critic of DQN": lambda: DQNLoss(grid_critic(), action_space="one_hot"),
+LOSSES: dict[str, Callable[[], objectives.LossModule]] = {
+    "critic of DDPG": lambda: objectives.DDPGLoss(network_policy(), critic(), delay_actor=True),
+    "critics of TD3": lambda: objectives.TD3Loss(network_policy(), critics(), bounds=BOUNDS),
+    "critics of CQL": lambda: objectives.CQLLoss(network_gaussian(), critics()),
+    "critics and value of IQL": lambda: objectives.IQLLoss(network_gaussian(), critics(), value()),
+    "critic of DQN": lambda: objectives.DQNLoss(grid_critic(), action_space="one_hot"),
     "V and Q of Q-learning": lambda: QPQLearningLoss(critic(), delay_value=True),
-    "actor of DDPG": lambda: DDPGLoss(policy(), network_critic(), delay_actor=True),
-    "actor and critics of TD3": lambda: TD3Loss(policy(), critics(), bounds=BOUNDS),
-    "mean and critics of SAC": lambda: SACLoss(qp_gaussian(), critics()),
-    "value and critics of SAC v1": lambda: SACLoss(network_gaussian(), critics(), value()),
-    "value of PPO": lambda: ClipPPOLoss(network_gaussian(), value()),
-    "mean and value of PPO": lambda: ClipPPOLoss(qp_gaussian(), value()),
+    "actor of DDPG": lambda: objectives.DDPGLoss(policy(), network_critic(), delay_actor=True),
+    "actor and critics of TD3": lambda: objectives.TD3Loss(policy(), critics(), bounds=BOUNDS),
+    "mean and critics of SAC": lambda: objectives.SACLoss(qp_gaussian(), critics()),
+    "value and critics of SAC v1": lambda: objectives.SACLoss(
+        network_gaussian(), critics(), value()
+    ),
+    "value of PPO": lambda: objectives.ClipPPOLoss(network_gaussian(), value()),
+    "mean and value of PPO": lambda: objectives.ClipPPOLoss(qp_gaussian(), value()),
     "V and Q of Q-learning, with a preview": lambda: QPQLearningLoss(
         critic(**PREVIEW), delay_value=True
     ),
-    "actor and critics of TD3, with a preview": lambda: TD3Loss(
+    "actor and critics of TD3, with a preview": lambda: objectives.TD3Loss(
         policy(**PREVIEW), critics(**PREVIEW), bounds=BOUNDS
     ),
     # TorchRL's losses pass the critics no entry that the actor does not read.
-    "mean, critics and value of IQL, with a preview": lambda: IQLLoss(
+    "mean, critics and value of IQL, with a preview": lambda: objectives.IQLLoss(
         qp_gaussian(**PREVIEW), critics(**PREVIEW), value(**PREVIEW)
     ),
-    "value of PPO, with a preview": lambda: ClipPPOLoss(network_gaussian(), value(**PREVIEW)),
+    "value of PPO, with a preview": lambda: objectives.ClipPPOLoss(
+        network_gaussian(), value(**PREVIEW)
+    ),
 }
 
 
-def make_loss(name: str, seed: int = 0) -> LossModule:
+def make_loss(name: str, seed: int = 0) -> objectives.LossModule:
     torch.manual_seed(seed)
     loss = LOSSES[name]()
     loss.make_value_estimator(gamma=GAMMA)
     return loss
 
 
-def make_batch(loss: LossModule | None = None) -> TensorDict:
+def make_batch(loss: objectives.LossModule | None = None) -> TensorDict:
     """Make two episodes of four transitions, some of them terminal, as ``loss`` needs them."""
     s = random_states(10, seed=3).float().view(2, 5, 2)
     preview = torch.cat((s.flip(-1), s.square()), -1)
@@ -180,17 +175,17 @@ def make_batch(loss: LossModule | None = None) -> TensorDict:
         batch_size=(2, 4),
     )
     td.names = [None, "time"]  # pyright: ignore[reportAttributeAccessIssue]
-    if isinstance(loss, DQNLoss):
+    if isinstance(loss, objectives.DQNLoss):
         nearest = (td["action"] - GRID.flatten()).abs().argmin(-1)
         td["action"] = nn.functional.one_hot(nearest, len(GRID))
-    if isinstance(loss, ClipPPOLoss):
+    if isinstance(loss, objectives.ClipPPOLoss):
         params: Any = loss.actor_network_params
         with torch.no_grad(), params.to_module(loss.actor_network):
             loss.actor_network(td)
     return td
 
 
-def total(loss: LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
+def total(loss: objectives.LossModule, batch: TensorDict, seed: int = 0) -> Tensor:
     torch.manual_seed(seed)
     out = loss(batch.copy())
     return torch.stack([x for key, x in out.items() if key.startswith("loss")]).sum()
@@ -263,6 +258,6 @@ def test_actions_beyond_a_critics_hard_bounds_are_refused_by_name():
     for operator in narrow:
         for bound in (operator.module.lb, operator.module.ub):
             bound[2] /= 4  # of u_0
-    loss = CQLLoss(network_gaussian(), narrow)
+    loss = objectives.CQLLoss(network_gaussian(), narrow)
     with pytest.raises(SolverError, match=r"INFEASIBLE.* soften rows with a finite w"):
         total(loss, make_batch())

@@ -457,26 +457,33 @@ def gradients(loss: QPQLearningLoss, td: TensorDictBase) -> tuple[TensorDictBase
     return out, list(result)
 
 
+def left_out(operator: Any, td: TensorDict, wrong: list[int], reduction: str) -> TensorDictBase:
+    """Compare a loss, its gradients and its metadata with those of the samples but for ``wrong``.
+
+    In the mean they count with zero error, so that alpha keeps its meaning.
+    """
+    others = td[[i for i in range(len(td)) if i not in wrong]].clone()
+    expected, step = gradients(make_loss(operator=operator, reduction="sum"), others)
+    out, total = gradients(make_loss(operator=operator, reduction=reduction), td)
+    count = len(td) if reduction == "mean" else 1
+    torch.testing.assert_close(out["loss_value"], expected["loss_value"] / count)
+    for gradient, other in zip(total, step, strict=True):
+        assert other.norm() > 0
+        torch.testing.assert_close(gradient, other / count)
+    for key in METADATA:
+        torch.testing.assert_close(out[key], expected[key], msg=key)
+    assert (td["td_error"][wrong] == 0).all()
+    assert td["td_error"].isfinite().all()
+    return out
+
+
 @pytest.mark.parametrize("bad", [5.0, torch.nan, torch.inf])
 @pytest.mark.parametrize("where", ["observation", "action", ("next", "observation")])
 def test_unsolved_samples_are_masked(where, bad):
     operator, td = hard_operator(), feasible_batch(6)
-    mean = make_loss(operator=operator)
-    solved = td[torch.tensor([0, 1, 3, 4, 5])]
-    expected, step = gradients(make_loss(operator=operator, reduction="sum"), solved)
     td[where][2] = bad
-    out, total = gradients(make_loss(operator=operator, reduction="sum"), td)
-    assert out["unsolved"].item() == 1
-    torch.testing.assert_close(out["loss_value"], expected["loss_value"])
-    for gradient, other in zip(total, step, strict=True):
-        assert other.norm() > 0
-        torch.testing.assert_close(gradient, other)
-    for key in METADATA:
-        torch.testing.assert_close(out[key], expected[key], msg=key)
-    assert td["td_error"][2] == 0
-    assert td["td_error"].isfinite().all()
-    # In the mean it counts with zero error, so that alpha keeps its meaning.
-    torch.testing.assert_close(mean(td)["loss_value"], expected["loss_value"] / 6)
+    for reduction in ("sum", "mean"):
+        assert left_out(operator, td, [2], reduction)["unsolved"].item() == 1
 
 
 @pytest.mark.parametrize("estimator", TRACE)
@@ -527,23 +534,13 @@ def test_ctrl_c_reaches_the_caller_and_leaves_theta_in_its_place(monkeypatch):
 @pytest.mark.parametrize("reduction", ["sum", "mean"])
 def test_invalid_rewards_are_left_out_and_counted(bad, reduction):
     operator, td = hard_operator(), feasible_batch(6)
-    solved = td[torch.tensor([0, 1, 3, 5])]
-    expected, step = gradients(make_loss(operator=operator, reduction="sum"), solved)
     td["next", "reward"][2] = bad
     td["next", "observation"][4] = 5.0  # and one without a solution
-    loss = make_loss(operator=operator, reduction=reduction)
     message = r"\('next', 'reward'\): 1 of 6 rewards are NaN or infinite\. Those transitions are"
     with pytest.warns(RuntimeWarning, match=message) as caught:
-        out, total = gradients(loss, td)
+        out = left_out(operator, td, [2, 4], reduction)
     assert len(caught) == 1
     assert (out["invalid_reward"].item(), out["unsolved"].item()) == (1, 1)
-    count = 6 if reduction == "mean" else 1
-    torch.testing.assert_close(out["loss_value"], expected["loss_value"] / count)
-    for gradient, other in zip(total, step, strict=True):
-        torch.testing.assert_close(gradient, other / count)
-    for key in METADATA:
-        torch.testing.assert_close(out[key], expected[key], msg=key)
-    assert td["td_error"][2] == 0
 
 
 @pytest.mark.parametrize("estimator", ["td1", "tdlambda"])

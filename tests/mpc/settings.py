@@ -93,6 +93,7 @@ PAPER: dict[str, dict[str, Any]] = {
 LINEAR: dict[str, dict[str, Any]] = {
     "tied": {},
     "tied, mixed rows": MIXED,
+    "blocks": {"blocks": [1, 3], **MIXED},
     "tied, diagonal": {"hessian": "diagonal", "stage_weight": [1.0, 0.5, 0.1]},
     "hard rows": {"constraint_slack": torch.inf, "constraints": ([[0.0, 0, 1]], [-0.4], [0.4])},
 }

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from torch.func import functional_call
 from torch.testing import assert_close
 
 from tests.problems import random_mpc, random_states
@@ -84,7 +83,6 @@ def dense(mpc: QPMPC, s: Tensor, held: list[int]) -> tuple[float, np.ndarray]:
     rows += [z[u[k]] == z[u[k - 1]] for k in held]
     problem = cvxpy.Problem(cvxpy.Minimize(cost), rows)
     problem.solve(solver="CLARABEL", tol_gap_rel=1e-12, tol_gap_abs=1e-12, tol_feas=1e-12)
-    assert z.value is not None
     return np.asarray(cost.value).item(), z.value[u]
 
 
@@ -119,18 +117,6 @@ def test_a_hard_bound_of_one_stage_binds_its_block(row):
     mpc.lb = lb
     u = mpc.predicted(mpc.solve(torch.tensor([9.0])).z)[1].squeeze(-1)
     assert_close(u, u.new_tensor([-0.3, -0.3, -1.0, -1.0]))
-
-
-def test_gradients_of_blocks_pass_finite_differences():
-    mpc = blocked([1, 3])
-    names, start = zip(*mpc.named_parameters(), strict=True)
-    s, a = random_states(4), 0.05 * random_states(4, 1)
-
-    def values(*theta: Tensor) -> Tensor:
-        named = dict(zip(names, theta, strict=True))
-        return torch.cat((functional_call(mpc, named, (s,)), functional_call(mpc, named, (s, a))))
-
-    assert torch.autograd.gradcheck(values, [x.detach().clone().requires_grad_() for x in start])
 
 
 def test_blocks_leave_fewer_variables_and_rows():

@@ -67,7 +67,6 @@ def enumerated(
 ) -> tuple[float, np.ndarray]:
     """Return the least cost of all plans, and the plan: all states follow from the actions."""
     bounds, levels = mpc.scheme.bounds, mpc.levels
-    assert levels is not None
     each = [
         sequences_of(len(bounds.action_levels[a]), bounds.min_off[a], bounds.min_on[a], mpc.horizon)
         for a in range(mpc.n_u)
@@ -132,7 +131,6 @@ def test_action_value_equals_enumeration_on_levels_and_is_infeasible_between_the
     best, _ = enumerated(mpc, s, a.numpy())
     assert mpc.action_value(s, a).item() == pytest.approx(best, rel=1e-6, abs=1e-9)
     assert mpc.action_value(s, mpc.policy(s)).item() == pytest.approx(mpc.value(s).item(), rel=1e-6)
-    assert mpc.levels is not None
     between = torch.from_numpy(mpc.levels.values[:, :2].mean(-1))
     with pytest.raises(qm.SolverError, match="INFEASIBLE"):
         mpc.action_value(s, between)
@@ -249,10 +247,7 @@ def test_a_saved_qpmpc_keeps_its_levels_and_states_do_not_mix(tmp_path):
     ({"min_on": 1.5}, "min_on: got 1.5"),
     ({"min_off": 0}, "min_off: got 0"),
     ({"start_cost": -1.0}, "start_cost: got -1.0, expected a number >= 0, or 1 of them"),
-    (
-        {"action_levels": None, "min_on": 2},
-        "min_on: got 2, expected action_levels or u_levels",
-    ),
+    ({"action_levels": None, "min_on": 2}, "min_on: got 2, expected action_levels or u_levels"),
     ({"max_nodes": 0}, "max_nodes: got 0"),
 )
 def test_wrong_levels_are_errors(options):
@@ -270,7 +265,6 @@ def test_compiled_policies_equal_python(seed):
         torch.testing.assert_close(policy(s), mpc.policy(s), rtol=0, atol=1e-8)
     capped = qm.CompiledPolicy(qm.QPMPC.of(**mpc.arguments | {"max_nodes": 20}))
     assert capped.value(s).isfinite().all()
-    assert capped.last is not None
     assert 5 in capped.last.codes
 
 

@@ -131,6 +131,7 @@ FUNCTIONS: dict[str, Callable[[QPMPC, Tensor, Tensor], Tensor]] = {
     [
         *itertools.product(PREVIEWED, ("action value", "solution")),
         *zip((*LINEAR, *PREVIEWED), itertools.cycle(("value", "action value")), strict=False),
+        ("masked", "value"),
     ],
 )
 def test_gradients_in_theta_and_p_agree_with_differences(name, function):
@@ -256,7 +257,6 @@ def test_hard_rows_and_missing_bounds_leave_the_gradient_finite():
     )
     mpc.value(random_states(6)).sum().backward()
     for name, parameter in mpc.named_parameters():
-        assert parameter.grad is not None
         assert parameter.grad.isfinite().all(), name
 
 
@@ -358,21 +358,9 @@ def test_released_entries_can_change():
     step(mpc, rate=0.01)
     assert (mpc.C[outside] != 0).any()
     mpc.value(s).sum().backward()
-    assert mpc.q.grad is not None
     assert (mpc.q.grad[:3] - mpc.q.grad[3:6]).abs().max() > 1e-3
     with pytest.raises(QPError, match="structure: got 'free', expected 'tied', which has"):
         mpc.model()
-
-
-def test_a_released_module_can_be_copied_and_reset():
-    mpc, s = linear(5), random_states(6)
-    mpc.release()
-    step(mpc)
-    twin = copy.deepcopy(mpc)
-    assert twin.structure == "free"
-    assert_close(twin.value(s), mpc.value(s), rtol=0, atol=0)
-    mpc.reset_parameters()
-    assert_close(mpc.value(s), linear(free=0.0).value(s))
 
 
 def test_the_parameters_order_survives_a_release_and_a_copy():
@@ -553,8 +541,7 @@ def test_predict_takes_any_array_of_numbers(kind):
     s = np.array([[1.0], [2.0], [-3.0]])
     for given in (s[::-1].astype(kind)[::-1], s.astype(kind)):
         given.flags.writeable = False
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with warnings.catch_warnings(action="error"):
             np.testing.assert_allclose(mpc.predict(given), mpc.predict(s), rtol=1e-6)
     with pytest.raises(QPError, match=r"observation: got ndarray, expected real numbers of shape"):
         mpc.predict(s + 1j)

@@ -1,7 +1,5 @@
 """`QPMPC.predict` of one state: the answers of a batch, after every kind of change of theta."""
 
-import copy
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -146,16 +144,6 @@ def test_a_functional_call_uses_its_own_theta():
         assert np.abs(found - expected).max() <= 1e-9
     assert np.abs(mpc.predict(s) - own).max() <= 1e-12
     assert np.abs(own - expected).max() > 1e-3
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_a_copy_has_a_theta_of_its_own(copied):
-    mpc = random_mpc(3)
-    own = mpc.predict(STATES[0])
-    twin = copied(mpc)
-    moved(twin)
-    assert_predicted(twin)
-    assert np.abs(mpc.predict(STATES[0]) - own).max() <= 1e-9
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -41,8 +41,7 @@ def test_lists_are_read_on_a_default_device_of_meta():
 def test_an_array_of_any_numbers_that_cannot_be_written_is_read_without_a_warning(kind):
     column = np.ones(2, kind)
     column.flags.writeable = False
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert as_tensor("x", column).tolist() == [1, 1]
 
 

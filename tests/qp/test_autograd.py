@@ -81,17 +81,6 @@ def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
         )
 
 
-@pytest.mark.parametrize("of_action", [False, True])
-def test_gradient_in_state_and_action_agrees_with_finite_differences(of_action):
-    mpc, s, a = random_mpc(0), random_states(6), random_states(6, 1, size=0.4)
-    s.requires_grad_()
-    a.requires_grad_()
-    if of_action:
-        assert torch.autograd.gradcheck(mpc.action_value, (s, a), eps=1e-5, atol=1e-4)
-    else:
-        assert torch.autograd.gradcheck(mpc.value, (s,), eps=1e-5, atol=1e-4)
-
-
 def test_batch_dimensions_broadcast_in_value_and_gradient():
     K, B = 3, 4
     shapes = {"H": (K, 1), "q": (B,), "c": (K, 1), "C": (1, B), "b": (), "G": (), "w": (K, 1)}
@@ -217,7 +206,6 @@ def test_an_unsolved_element_has_no_gradient_whatever_comes_in(incoming, part):
     weight = torch.tensor([1.0, incoming, 1.0]).double()
     outcome.backward(weight.reshape(3, *(1,) * (outcome.ndim - 1)).expand_as(outcome))
     for name, operand in zip(OPERANDS, operands, strict=True):
-        assert operand.grad is not None
         assert operand.grad.isfinite().all(), name
         assert (operand.grad[1] == 0).all(), name
     assert (operands[0].grad[0] != 0).any()  # pyright: ignore[reportOptionalSubscript] - seen above
@@ -235,7 +223,6 @@ def test_invalid_elements_have_no_gradient_and_spoil_no_other():
         assert_close(values, torch.where(torch.arange(3) == 1, torch.inf, known.value))
         values[values.isfinite()].sum().backward()
         for operand in spoilt:
-            assert operand.grad is not None
             assert operand.grad.isfinite().all(), OPERANDS[i]
 
 
@@ -272,18 +259,6 @@ def test_the_operator_keeps_torchs_contract():
 # Outputs
 
 
-@pytest.mark.parametrize("batch", [(), (0,), (1,), (5,), (2, 3)])
-@pytest.mark.parametrize("of_matrices", [False, True])
-def test_shapes_of_the_solution(batch, of_matrices):
-    known = known_qp(10, batch=batch, matrices=batch if of_matrices else ())
-    found = solve_qp(known.qp, known.fixed, solver="daqp")
-    for name, part in solution_of(known).items():
-        assert getattr(found, name).shape == part.shape, name
-    for name in ("status", "residual", "iterations"):
-        assert getattr(found, name).shape == batch, name
-    assert found.mu.shape == known.sigma.shape
-
-
 def test_multipliers_of_a_row_sum_to_its_weight():
     known = known_qp(11, batch=(4,))
     found = solve_qp(known.qp, known.fixed, solver="daqp")
@@ -305,7 +280,6 @@ def test_single_precision_in_single_precision_out(solver):
         assert_close(getattr(found, name), part, rtol=1e-3, atol=1e-3)
     found.value.sum().backward()
     for operand in operands:
-        assert operand.grad is not None
         assert operand.grad.dtype == torch.float32
 
 

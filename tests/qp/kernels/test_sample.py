@@ -8,15 +8,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from tests.problems import (
-    KnownQP,
-    certified,
-    known_qp,
-    programs_of,
-    random_mpc,
-    random_states,
-    within,
-)
+from tests import problems
 from torch_qpmpc.qp.kernels import sample
 from torch_qpmpc.qp.kernels.sample import CLOSE
 from torch_qpmpc.qp.pipeline import batch
@@ -40,10 +32,10 @@ SPOILERS = {
 }
 
 
-def reference(known: KnownQP, **candidate: Tensor) -> float:
+def reference(known: problems.KnownQP, **candidate: Tensor) -> float:
     """Compute the certificate's residual of one QP by the formulas of its docstring."""
     H, q, _, C, b, G, lb, ub, w = (x.numpy() for x in known.qp.tensors())
-    candidate["lam"] = within(candidate["lam"], *known.qp.tensors()[-3:])
+    candidate["lam"] = problems.within(candidate["lam"], *known.qp.tensors()[-3:])
     z, lam, chi, xi = (candidate[n].numpy() for n in ("z", "lam", "chi", "xi"))
     n_f = len(xi)
 
@@ -73,13 +65,13 @@ def reference(known: KnownQP, **candidate: Tensor) -> float:
 @pytest.mark.parametrize("name", ["nothing", "z", "lam", "chi", "xi", "large"])
 def test_the_residual_is_the_certificates(name):
     for seed in range(4):
-        known = known_qp(seed)
+        known = problems.known_qp(seed)
         candidate = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
         SPOILERS[name](candidate)
         expected = reference(known, **candidate)
         claim = (x.unsqueeze(0) for x in candidate.values())
-        p = programs_of(replace(known, fixed=known.fixed.unsqueeze(0)))
-        residual = certified(p, *claim)[1]
+        p = problems.programs_of(replace(known, fixed=known.fixed.unsqueeze(0)))
+        residual = problems.certified(p, *claim)[1]
         # A bound of the terms of a row, until they are summed.
         near = 0.0 if expected > CLOSE else CLOSE
         assert_close(residual.item(), float(expected), rtol=1e-9, atol=max(near, 1e-13))
@@ -90,13 +82,13 @@ def test_the_residual_is_the_certificates(name):
 def test_qps_of_a_batch_are_certified_as_each_alone(name, matrices):
     """Also beside claims with NaN and inf, whose residuals and errors are infinite."""
     for seed in range(3):
-        known = known_qp(seed, batch=(BATCH,), matrices=matrices)
+        known = problems.known_qp(seed, batch=(BATCH,), matrices=matrices)
         claim = {n: getattr(known, n).clone() for n in ("z", "lam", "chi", "xi")}
         SPOILERS[name](claim)
-        p = programs_of(known)
-        value, residual, error = certified(p, *claim.values())
+        p = problems.programs_of(known)
+        value, residual, error = problems.certified(p, *claim.values())
         for i in range(BATCH):
-            one = certified(p.take(np.array([i])), *(x[i : i + 1] for x in claim.values()))
+            one = problems.certified(p.take(np.array([i])), *(x[i : i + 1] for x in claim.values()))
             assert_close(residual[i : i + 1], one[1], rtol=1e-9, atol=CLOSE)
             if residual[i].isfinite():
                 assert_close(value[i : i + 1], one[0])
@@ -109,7 +101,7 @@ def test_qps_of_a_batch_are_certified_as_each_alone(name, matrices):
 
 
 def test_many_qps_are_completed_and_recalled_in_threads_as_in_one(monkeypatch):
-    mpc, s = random_mpc(4, horizon=6), random_states(48, size=0.7).double()
+    mpc, s = problems.random_mpc(4, horizon=6), problems.random_states(48, size=0.7).double()
     p = Programs.of(*mpc.quadratic_program().tensors(), s)[0]
     found = daqp.solve(p.reduced_qps())
     expected = p.recover(found)

@@ -8,14 +8,8 @@ from torch.testing import assert_close
 
 from tests.problems import known_qp, normal
 from torch_qpmpc import Status, solve_qp
+from torch_qpmpc.qp.pipeline import condensing
 from torch_qpmpc.qp.pipeline.arrays import Theta
-from torch_qpmpc.qp.pipeline.condensing import (
-    PROXIMAL,
-    SHIFT,
-    condense,
-    dual,
-    sizes,
-)
 from torch_qpmpc.qp.solve import solve
 
 # Rows of C for the problems below, with 3 of 8 entries fixed.
@@ -83,15 +77,15 @@ def test_a_row_of_any_scale_counts():
 def test_only_proximal_steps_shift_what_a_small_curvature_makes_definite():
     G = np.eye(2)[None]
     H = np.diag([1e4, 0.0])[None]
-    assert dual(H, G).shift == pytest.approx(1e4 * PROXIMAL)
-    searched = dual(H, G, 1e-8)  # not definite up to rounding
-    assert searched.shift == pytest.approx(1e4 * SHIFT)
-    assert dual(H, G, 1e-6).shift == 0
+    assert condensing.dual(H, G).shift == pytest.approx(1e4 * condensing.PROXIMAL)
+    searched = condensing.dual(H, G, 1e-8)  # not definite up to rounding
+    assert searched.shift == pytest.approx(1e4 * condensing.SHIFT)
+    assert condensing.dual(H, G, 1e-6).shift == 0
 
 
 def test_steps_are_the_lengths_of_rows():
     G = torch.tensor([[[1.0, 0.0], [1.2, 1.6]]]).double()
     theta = theta_of(torch.eye(2)[None].double(), torch.zeros(1, 0, 2).double(), G)
     theta = theta._replace(w=np.full((1, 2), np.inf))
-    found = sizes(condense(theta, 0), theta, 0)
+    found = condensing.sizes(condensing.condense(theta, 0), theta, 0)
     np.testing.assert_allclose(found.steps, [[1, 2]])

@@ -22,8 +22,8 @@ def test_other_bounds_are_in_the_same_units_even_if_those_are_far_from_one():
     lb, ub, far, q = -np.full((1, 2), 1e-3), np.ones((1, 2)), np.full((1, 1), 1e5), np.ones((1, 4))
     theta = Theta(H, C, G, q, np.zeros(1), far, lb, ub, np.full((1, 2), np.inf))
     prepared = Prepared(theta, np.zeros(1, np.int64), 1)
-    assert prepared.units is not None
     assert Units.of(prepared.scaled.theta, prepared.group) is not None
+    assert prepared.units is not None
     other = prepared.bounded(2 * lb, 3 * ub)
     assert other.units is prepared.units
     for own, new in zip(prepared.scaled.theta[-3:-1], other.scaled.theta[-3:-1], strict=True):

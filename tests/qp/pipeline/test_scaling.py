@@ -44,7 +44,6 @@ def test_units_are_powers_of_two_and_make_sizes_ordinary(matrices):
     known = known_qp(0, batch=(BATCH,), matrices=matrices)
     assert programs_of(known).prepared.units is None
     prepared = programs_of(in_size(known, cost=1e-9, variables=1e5)).prepared
-    assert prepared.units is not None
     assert all((np.frexp(unit)[0] == 0.5).all() for unit in prepared.units[:4])
     assert prepared.scaled.units is None
 
@@ -62,7 +61,6 @@ def test_far_bounds_of_some_qps_are_no_length_for_the_others(solver):
     assert_close(solution.value, known.value, rtol=1e-6, atol=size)
     assert_close(solution.z, known.z, rtol=0, atol=1e-12)
     units = programs_of(replace(known, qp=qp)).prepared.units
-    assert units is not None
     assert units.length.max() < 1e-6
 
 
@@ -92,7 +90,6 @@ def test_entries_that_all_but_vanish_set_no_unit(solver, seed):
     solution = solve_qp(noisy, s, solver=solver)
     assert_close(solution.value, solve_qp(plain, s, solver=solver).value, rtol=1e-6, atol=0)
     units = Programs.of(*noisy.tensors(), s)[0].prepared.units
-    assert units is not None
     assert units.length.max() < 1000 * units.length.min()
 
 

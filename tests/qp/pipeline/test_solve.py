@@ -13,18 +13,8 @@ import torch
 from torch.testing import assert_close
 
 import torch_qpmpc
+import torch_qpmpc as qm
 from tests.problems import KnownQP, certified, known_qp, normal
-from torch_qpmpc import (
-    QPMPC,
-    Controller,
-    LinearMPC,
-    QPError,
-    QuadraticProgram,
-    SolveLog,
-    SolverError,
-    Status,
-    solve_qp,
-)
 from torch_qpmpc.envs import PointMass
 from torch_qpmpc.qp.pipeline import refinement
 from torch_qpmpc.qp.pipeline.arrays import BatchSolution, SoftQPs
@@ -84,11 +74,11 @@ def counts(asked: list[SoftQPs]) -> list[int]:
 
 
 def solve(known: KnownQP, **options) -> QPSolution:
-    return solve_qp(known.qp, known.fixed, **options)
+    return qm.solve_qp(known.qp, known.fixed, **options)
 
 
 def assert_right(solution: QPSolution, known: KnownQP) -> None:
-    assert (solution.status == Status.SOLVED).all()
+    assert (solution.status == qm.Status.SOLVED).all()
     assert_close(solution.value, known.value)
     assert_close(solution.z, known.z, rtol=1e-4, atol=1e-4)
 
@@ -113,13 +103,13 @@ def test_errors_of_a_cost_of_zero_are_relative_to_the_swing(monkeypatch, off, ub
     H, G = torch.diag(torch.tensor([0.0, 1e-4, 1e-4])), torch.tensor([[0, 3.0, 0], [0, 0, 0.5]])
     two, q = torch.ones(2).double(), torch.tensor([0.0, 0.03, 0.7]).double()
     parts: Any = {"G": G.double(), "lb": 0 * two, "ub": ub * two, "w": w * two}
-    qp = QuadraticProgram(H.double(), q, **parts, check_values=False)
-    solution = solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
+    qp = qm.QuadraticProgram(H.double(), q, **parts, check_values=False)
+    solution = qm.solve_qp(qp, torch.linspace(0.5, 1, BATCH).double()[:, None], solver="above")
     assert solution.iterations.any() == refined  # those of the refinement
     assert_close(solution.value, torch.zeros(BATCH).double(), atol=1e-12, rtol=0)
 
 
-def standing(stages: int) -> QuadraticProgram:
+def standing(stages: int) -> qm.QuadraticProgram:
     """Return a body on one of two legs at a time: all forces that carry it cost nothing."""
     dt, n = 0.02, 4 * stages
     C, ub = torch.zeros(2 * stages, n).double(), torch.full((stages, 4), torch.inf).double()
@@ -132,12 +122,12 @@ def standing(stages: int) -> QuadraticProgram:
     H = torch.diag(torch.tensor([0, 0, 10, 0.3]).double().repeat(stages))
     b, G = torch.tensor([0, -9.81 * dt]).double().repeat(stages), torch.block_diag(*[rows] * stages)
     q = torch.zeros(n).double()
-    return QuadraticProgram(H, q, C=C, b=b, G=G, lb=q, ub=ub.flatten())
+    return qm.QuadraticProgram(H, q, C=C, b=b, G=G, lb=q, ub=ub.flatten())
 
 
 @pytest.mark.parametrize("solver", BACKENDS)
 def test_a_cost_of_zero_without_curvature_is_certified(solver):
-    solution = solve_qp(standing(8), solver=solver)
+    solution = qm.solve_qp(standing(8), solver=solver)
     assert_close(solution.value, torch.zeros(()).double(), atol=1e-18, rtol=0)
 
 
@@ -161,7 +151,7 @@ def test_rounding_of_multipliers_that_cancel_is_no_error_of_the_value(speed, rig
 @pytest.mark.parametrize("liar", LIES, indirect=True)
 def test_wrong_answers_are_caught_and_replaced(liar):
     known = known_qp(0, batch=(BATCH,))
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         solution = solve(known, solver=liar)
     assert_right(solution, known)
     assert (log.solves, log.unsolved) == (BATCH, 0)
@@ -173,7 +163,7 @@ def test_wrong_answers_are_caught_and_replaced(liar):
 def test_inaccurate_answers_are_sharpened_or_of_many_solved_again(monkeypatch, name, count):
     monkeypatch.setitem(BACKENDS, "coarse", doctored(INACCURACIES[name]))
     known = known_qp(0, batch=(count,), matrices=(count,))
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         solution = solve(known, solver="coarse")
     assert_right(solution, known)
     assert (log.refined, log.fallback) == ((count, 0) if count <= FEW else (0, count))
@@ -188,7 +178,7 @@ def test_only_rejected_solutions_are_solved_again(monkeypatch):
 
     monkeypatch.setitem(BACKENDS, "liar", doctored(lie))
     known = known_qp(1, batch=(BATCH,), matrices=(BATCH,))
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         solution = solve(known, solver="liar")
     assert_right(solution, known)
     assert log.fallback == 3
@@ -219,7 +209,7 @@ def test_qps_at_rest_have_the_solutions_of_a_batch(seed, units):
     known = replace(known, qp=qp)
     batch = solve(known, solver="daqp", on_failure="mask")
     batch = solve(known, solver="daqp", on_failure="mask", warm_start=batch)
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         rest = at_rest(known)
         answers = one_by_one(known, rest)
     assert (rest.prepared.units is None) == (units == 1)
@@ -244,16 +234,16 @@ def test_qps_at_rest_have_the_solutions_of_a_batch(seed, units):
 def test_a_cost_that_is_not_convex_has_no_solution_at_rest():
     known = shared(2)
     rest = at_rest(known, H=-known.qp.H, check_values=False)
-    assert {x.status[0] for x in one_by_one(known, rest)} == {Status.INVALID_DATA}
+    assert {x.status[0] for x in one_by_one(known, rest)} == {qm.Status.INVALID_DATA}
     nan = np.full((1, known.fixed.shape[-1]), np.nan)
-    assert at_rest(known).solve(nan).status[0] == Status.INVALID_DATA
+    assert at_rest(known).solve(nan).status[0] == qm.Status.INVALID_DATA
 
 
 def test_a_solver_does_not_get_its_failures_again(monkeypatch, asked):
     recorder = BACKENDS["recorder"]
     monkeypatch.setitem(BACKENDS, "liar", lambda qps: LIES["v off"](recorder(qps)))
     known = known_qp(3, batch=(BATCH,))
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         assert_right(solve(known, solver="liar"), known)
     assert counts(asked) == [BATCH]
     assert (log.fallback, log.recalled) == (BATCH, 0)
@@ -266,7 +256,7 @@ def test_active_sets_right_or_unknown_avoid_the_backend(asked, ones):
     active = solve(known, solver="torch").active
     unknown = torch.full_like(active, UNKNOWN)
     unknown[ones] = active[ones]
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         assert_right(solve(known, solver="recorder", warm_start=unknown), known)
     assert counts(asked) == []
     assert (log.fallback, log.recalled) == (0, BATCH)
@@ -287,7 +277,7 @@ def nobody_solves(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(BACKENDS, name, nothing)
     monkeypatch.setattr(interior_point, "solve", lambda qps, **_: nothing(qps))
     monkeypatch.setattr(refinement, "MAX_SETS", 0)
-    lost = lambda self, active: self.unsolved(Status.NOT_CONVERGED)  # noqa: E731
+    lost = lambda self, active: self.unsolved(qm.Status.NOT_CONVERGED)  # noqa: E731
     monkeypatch.setattr(Programs, "recalled", lost)
 
 
@@ -298,14 +288,14 @@ def test_unsolved_qps_are_not_converged(recwarn):
         r"6 of 6 QPs have no certified solution. 6 NOT_CONVERGED, first at batch index \(0, 0\): "
         r"no solver reached the certificate's tolerance, and the QP is neither"
     )
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         solution = solve(known, on_failure="mask")
     assert not recwarn
-    assert (solution.status == Status.NOT_CONVERGED).all()
+    assert (solution.status == qm.Status.NOT_CONVERGED).all()
     assert (solution.value == torch.inf).all()
     assert (solution.residual > 1e-6).all()
     assert (log.solves, log.unsolved) == (6, 6)
-    with pytest.raises(SolverError, match=message):
+    with pytest.raises(qm.SolverError, match=message):
         solve(known)
     with pytest.warns(RuntimeWarning, match=message):
         solve(known, on_failure="warn")
@@ -322,7 +312,7 @@ def spoil(known: KnownQP, index: int) -> KnownQP:
 
 def test_the_log_adds_up_all_solves_of_its_block():
     known = known_qp(5, batch=(BATCH,))
-    with SolveLog() as log:
+    with qm.SolveLog() as log:
         first = solve(known)
         second = solve(spoil(known, 1), on_failure="mask")
     solve(known)
@@ -335,26 +325,18 @@ def test_the_log_adds_up_all_solves_of_its_block():
 
 
 def test_the_log_reports_the_metrics_of_training():
-    log = SolveLog(
-        solves=4, unsolved=1, fallback=2, recalled=3, iterations=10, residual=1e-8, seconds=0.5
-    )
-    assert log.metrics() == {
-        "qp/solves": 4,
-        "qp/unsolved": 1,
-        "qp/fallback": 2,
-        "qp/recalled": 3,
-        "qp/iterations": 2.5,
-        "qp/residual": 1e-8,
-        "time/qp": 0.5,
-    }
-    assert SolveLog().metrics()["qp/iterations"] == 0
+    counts = {"solves": 4, "unsolved": 1, "fallback": 2, "recalled": 3, "residual": 1e-8}
+    log = qm.SolveLog(**counts, iterations=10, seconds=0.5)
+    expected = {f"qp/{name}": x for name, x in counts.items()}
+    assert log.metrics() == expected | {"qp/iterations": 2.5, "time/qp": 0.5}
+    assert qm.SolveLog().metrics()["qp/iterations"] == 0
 
 
 def test_an_inner_log_takes_over_for_its_block_and_ends_even_by_an_error():
     known = known_qp(5, batch=(BATCH,))
-    with SolveLog() as outer:
+    with qm.SolveLog() as outer:
         solve(known)
-        with pytest.raises(QPError, match="solver"), SolveLog() as inner:
+        with pytest.raises(qm.QPError, match="solver"), qm.SolveLog() as inner:
             _ = [solve(known, solver=solver) for solver in ("daqp", "none")]
         solve(known)
     assert (outer.solves, inner.solves) == (2 * BATCH, BATCH)
@@ -364,11 +346,11 @@ def test_the_log_counts_its_own_thread_only():
     known = known_qp(5, batch=(BATCH,))
 
     def logged() -> int:
-        with SolveLog() as log:
+        with qm.SolveLog() as log:
             solve(known)
         return log.solves
 
-    with SolveLog() as log, ThreadPoolExecutor(2) as pool:
+    with qm.SolveLog() as log, ThreadPoolExecutor(2) as pool:
         counts = list(pool.map(lambda _: logged(), range(4)))
     assert counts == [BATCH] * 4
     assert log.solves == 0
@@ -388,11 +370,11 @@ def test_invalid_elements_reach_no_backend(asked):
     solution = solve(known, solver="recorder", on_failure="mask")
     assert counts(asked) == [BATCH - 1]
     assert np.isfinite(asked[0].g).all()
-    assert solution.status.tolist() == [0, 0, Status.INVALID_DATA, 0, 0, 0]
+    assert solution.status.tolist() == [0, 0, qm.Status.INVALID_DATA, 0, 0, 0]
     asked.clear()
     known = spoil(known_qp(8, batch=(1,)), 0)
     alone = solve(known, solver="recorder", on_failure="mask")
-    assert alone.status.tolist() == [Status.INVALID_DATA]
+    assert alone.status.tolist() == [qm.Status.INVALID_DATA]
     assert solve(known_qp(8, batch=(0,)), solver="recorder").status.shape == (0,)
     assert asked == []
 
@@ -401,11 +383,11 @@ def test_an_indefinite_hessian_is_not_certified(solver):
     """A stationary point of a concave cost satisfies all first-order conditions."""
     known = known_qp(0)
     H = known.qp.H - 1e3 * torch.eye(known.qp.n_z).double()
-    indefinite = QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
-    found = solve_qp(indefinite, known.fixed, solver=solver, on_failure="mask")
-    assert found.status == Status.INVALID_DATA
+    indefinite = qm.QuadraticProgram(H, *known.qp.tensors()[1:], check_values=False)
+    found = qm.solve_qp(indefinite, known.fixed, solver=solver, on_failure="mask")
+    assert found.status == qm.Status.INVALID_DATA
     with pytest.raises(ValueError, match="not positive semidefinite"):
-        solve_qp(indefinite, known.fixed, solver=solver)
+        qm.solve_qp(indefinite, known.fixed, solver=solver)
 
 
 @pytest.mark.parametrize("solver", ["proxqp", "daqp"])
@@ -416,7 +398,7 @@ def test_a_row_that_the_fixed_entries_decide_but_for_rounding_is_no_row(solver):
     """
     physics = PointMass()
     A, B, theta = physics.corrupted(1)
-    mpc = QPMPC.from_model(
+    mpc = qm.QPMPC.from_model(
         A,
         B,
         10,
@@ -457,11 +439,11 @@ def test_a_value_and_a_step_change_files_seldom():
     """A reader of the call changes page as often."""
     A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
     bounds: Any = {"state_bounds": ([-1.0, -1.0], [1.0, 1.0]), "action_bounds": ([-1.0], [1.0])}
-    mpc = QPMPC.from_model(A, B, 10, stage_weight=[1.0, 0.1, 0.01], solver="daqp", **bounds)
+    mpc = qm.QPMPC.from_model(A, B, 10, stage_weight=[1.0, 0.1, 0.01], solver="daqp", **bounds)
     files = files_called(lambda: mpc.value(torch.tensor([[0.3, -0.2]]).double()))
     assert len(files) <= 26
     assert len(files) - len(set(files)) <= 14
     assert len(set(files)) <= 12
-    linear = LinearMPC((A, B, [[1.0, 0.0]]), 10, Q=[1.0], dR=[0.1], u_bounds=(-1.0, 1.0))
-    controller = Controller(linear)
+    linear = qm.LinearMPC((A, B, [[1.0, 0.0]]), 10, Q=[1.0], dR=[0.1], u_bounds=(-1.0, 1.0))
+    controller = qm.Controller(linear)
     assert len(files_called(lambda: controller.step([0.1], [0.5]))) <= 30

@@ -4,14 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.problems import (
-    KnownQP,
-    known_qp,
-    one_sided,
-    random_mpc,
-    random_states,
-    solution_of,
-)
+from tests import problems
 from tests.references import by_cvxpy, by_quadprog
 from tests.refused import refused
 from torch_qpmpc import SolveLog, solve_qp
@@ -21,14 +14,14 @@ BATCHES = [((), ()), ((1,), ()), ((6,), ()), ((6,), (6,)), ((3, 4), (3, 1)), ((3
 
 
 def assert_solves(
-    known: KnownQP, solver: str, *, only_value: bool = False, scale: float = 1.0
+    known: problems.KnownQP, solver: str, *, only_value: bool = False, scale: float = 1.0
 ) -> None:
     """Solve without another solver's help, and compare with the known solution."""
     with SolveLog() as log:
         solution = solve_qp(known.qp, known.fixed, solver=solver)
     assert log.fallback == 0
     assert solution.residual.max() < 1e-6
-    for name, expected in solution_of(known).items():
+    for name, expected in problems.solution_of(known).items():
         if name == "value" or not only_value:
             tolerance = 1e-6 if name == "value" else 1e-4
             actual = getattr(solution, name)
@@ -41,12 +34,12 @@ def assert_solves(
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("batch", "matrices"), BATCHES)
 def test_known_solutions_are_found(solver, batch, matrices, seed):
-    assert_solves(known_qp(seed, batch=batch, matrices=matrices), solver)
+    assert_solves(problems.known_qp(seed, batch=batch, matrices=matrices), solver)
 
 
 @pytest.mark.parametrize("batch", [(0,), (2, 0)])
 def test_an_empty_batch_is_solved(solver, batch):
-    known = known_qp(0, batch=batch)
+    known = problems.known_qp(0, batch=batch)
     solution = solve_qp(known.qp, known.fixed, solver=solver)
     assert solution.value.shape == batch
     again = solve_qp(known.qp, known.fixed, solver=solver, warm_start=solution)
@@ -71,26 +64,26 @@ def test_an_empty_batch_is_solved(solver, batch):
     ids=str,
 )
 def test_parts_of_a_program_may_be_missing(solver, options):
-    assert_solves(known_qp(1, batch=(4,), **options), solver)
+    assert_solves(problems.known_qp(1, batch=(4,), **options), solver)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_soft_rows_with_one_bound(solver, seed):
-    assert_solves(one_sided(seed), solver)
+    assert_solves(problems.one_sided(seed), solver)
 
 
 @pytest.mark.parametrize("weight", [1e-2, 1.0, 1e2, 1e4])
 def test_slack_weights_of_any_size(solver, weight):
-    assert_solves(known_qp(2, batch=(6,), weight=weight), solver, scale=max(weight, 1.0))
+    assert_solves(problems.known_qp(2, batch=(6,), weight=weight), solver, scale=max(weight, 1.0))
 
 
 @pytest.mark.parametrize("rank", [0, 1, 5])
 def test_costs_without_curvature(solver, rank):
-    assert_solves(known_qp(3, batch=(6,), rank=rank), solver, only_value=True)
+    assert_solves(problems.known_qp(3, batch=(6,), rank=rank), solver, only_value=True)
 
 
 def test_the_answer_does_not_depend_on_what_was_solved_before(solver):
-    known, other = known_qp(5, batch=(3,)), known_qp(6, batch=(3,))
+    known, other = problems.known_qp(5, batch=(3,)), problems.known_qp(6, batch=(3,))
     first = solve_qp(known.qp, known.fixed, solver=solver)
     solve_qp(other.qp, other.fixed, solver=solver)
     again = solve_qp(known.qp, known.fixed, solver=solver)
@@ -100,7 +93,7 @@ def test_the_answer_does_not_depend_on_what_was_solved_before(solver):
 
 @pytest.mark.usefixtures("two_threads")
 def test_solving_in_parallel_changes_nothing_but_the_time(solver):
-    known = known_qp(7, batch=(16,))
+    known = problems.known_qp(7, batch=(16,))
     assert_solves(known, solver)
     assert torch.get_num_threads() == 2
 
@@ -112,8 +105,8 @@ def test_solving_in_parallel_changes_nothing_but_the_time(solver):
 def mpc_case(request):
     """Make a QP with dense C, states (and actions), and reference values and solutions."""
     learn = ("H", "H_f", "q", "c", "C", "b")
-    mpc = random_mpc(1, free=0.2, learn=learn)
-    s, a = random_states(8), random_states(8, 1, size=0.5)
+    mpc = problems.random_mpc(1, free=0.2, learn=learn)
+    s, a = problems.random_states(8), problems.random_states(8, 1, size=0.5)
     fixed = torch.cat((s, a), -1) if request.param == "Q" else s
     qp = mpc.quadratic_program()
     return qp, fixed, [(by_cvxpy(qp, one), by_quadprog(qp, one)) for one in fixed]
@@ -135,7 +128,7 @@ def test_two_other_solvers_of_the_printed_program_agree(solver, mpc_case):
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_a_warm_start_from_the_solution_saves_iterations(name):
-    mpc, s = random_mpc(13, solver=name, horizon=8), random_states(12, size=0.7)
+    mpc, s = problems.random_mpc(13, solver=name, horizon=8), problems.random_states(12, size=0.7)
     cold = mpc.solve(s)
     warm = mpc.solve(s, warm_start=cold.active)
     assert warm.iterations.sum() < 0.7 * cold.iterations.sum()
@@ -157,7 +150,7 @@ def test_an_unknown_backend_is_named(name):
 
 def test_rows_that_are_hard_in_some_of_a_batch_only(solver):
     """A backend's model must not be reused across patterns of soft rows."""
-    known = known_qp(5, batch=(24,))
+    known = problems.known_qp(5, batch=(24,))
     w = known.qp.w.expand(24, -1).clone()
     inside = (known.sigma == 0) & w.isfinite()
     harden = inside & (torch.arange(24) % 3 == 0).unsqueeze(-1)
