@@ -1,5 +1,6 @@
 """Controllers of nonlinear plants: a function, or what a log teaches."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -105,8 +106,9 @@ def test_a_linear_function_is_the_linear_plant(references, monkeypatch):
     for name in ("x", "w", "p"):
         assert_allclose(getattr(pair[1], name), getattr(pair[0], name), atol=1e-6)
     for texts in zip(*((str(own.review()), str(own.explain())) for own in pair), strict=True):
-        assert texts[0] == texts[1].replace(LOCAL, "")
-        assert LOCAL in texts[1]
+        linear, function = (re.sub(r"\S+e-1\d", "0", text) for text in texts)  # but for rounding
+        assert linear == function.replace(LOCAL, "")
+        assert LOCAL in function
 
 
 def test_known_flows_are_fed_forward():
