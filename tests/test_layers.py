@@ -34,7 +34,7 @@ BUDGET = {
     "export": 1425,
     "learning": 2750,  # models that did not train theta decide in improve
     "identification": 2780,  # drifts keep steady gains right
-    "mpc": 3810,
+    "mpc": 3806,
     "proofs": 998,
     "qp": 5234,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for
