@@ -34,7 +34,7 @@ BUDGET = {
     "export": 1386,
     "learning": 2750,  # models that did not train theta decide in improve
     "identification": 2778,  # drifts keep steady gains right
-    "mpc": 3778,
+    "mpc": 3774,
     "proofs": 1001,
     "qp": 5206,
     "study": 556,  # load_run(..).predict, which refinement's second start pays for

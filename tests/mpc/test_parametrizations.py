@@ -8,6 +8,7 @@ from torch_qpmpc.mpc.parametrizations import Cholesky, SquareRoot
 
 FACTOR = normal(4, 4)
 DIRECTION = normal(4, 1)
+UNITS = torch.tensor([[1.0], [1e9], [1e-3], [1e4]]).double()
 MATRICES = {
     "positive definite": FACTOR @ FACTOR.mT,
     "rank one": DIRECTION @ DIRECTION.mT,
@@ -15,6 +16,8 @@ MATRICES = {
     "diagonal with zeros": torch.diag(torch.tensor([0.0, 2.0, 0.0, 3.0])).double(),
     "batch": torch.stack((FACTOR @ FACTOR.mT, DIRECTION @ DIRECTION.mT)),
     "tiny": 1e-12 * FACTOR @ FACTOR.mT,
+    "far units": UNITS * (FACTOR @ FACTOR.mT) * UNITS.mT,
+    "far units, rank one": UNITS * (DIRECTION @ DIRECTION.mT) * UNITS.mT,
 }
 
 
@@ -22,10 +25,17 @@ MATRICES = {
 def test_cholesky_factor_of_any_semidefinite_matrix(name):
     H = MATRICES[name]
     factor = Cholesky().right_inverse(H)
-    scale = float(H.abs().max())
-    assert_close(Cholesky()(factor), H, rtol=0, atol=1e-12 * scale)
+    size = H.diagonal(dim1=-2, dim2=-1).sqrt().unsqueeze(-1)
+    size = torch.where(size > 0, size, size.amax(-2, keepdim=True))
+    error = (Cholesky()(factor) - H).abs()
+    assert (error <= 1e-12 * size * size.mT).all()
     assert (factor.triu(1) == 0).all()
     assert (factor.diagonal(dim1=-2, dim2=-1) >= 0).all()
+
+
+def test_cholesky_factor_of_a_matrix_that_rounding_left_indefinite():
+    H = torch.tensor([[1.0, 1e-5], [1e-5, 1e-20]]).double()
+    assert_close(Cholesky()(Cholesky().right_inverse(H)), H, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rank one", "diagonal with zeros"])

@@ -123,7 +123,7 @@ class Symmetric(nn.Module):
 
     def right_inverse(self, value: Tensor) -> Tensor:
         """Return ``value``; raise `QPError` if its other block is not positive semidefinite."""
-        _spectrum(value[..., self.n_free :, self.n_free :])
+        check_weight("H", (value + value.mT) / 2, diagonal=False, n_d=self.n_free)
         return value
 
 
@@ -148,17 +148,22 @@ class Cholesky(nn.Module):
         return torch.cat((upper, torch.cat((S, lower @ lower.mT), dim=-1)), dim=-2)
 
     def right_inverse(self, value: Tensor) -> Tensor:
-        """Return a factor of a possibly singular ``value``, by QR of its symmetric square root."""
+        """Return a factor of a possibly singular ``value``, by QR of a root in units of H_ii.
+
+        In these no entry is rounding beside another, if rounding has left ``value`` definite there.
+        """
         n = self.n_free
-        eigenvalues, vectors = _spectrum(value[..., n:, n:])
-        root = vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
+        check_weight("H", H := (value + value.mT)[..., n:, n:] / 2, diagonal=False, n_d=0)
+        size = H.diagonal(dim1=-2, dim2=-1).clamp(min=0).sqrt()
+        size = torch.where(size > 0, size, 1).unsqueeze(-1)
+        lowest = torch.linalg.eigvalsh(H / size / size.mT)[..., :1].unsqueeze(-1)
+        size = size.masked_fill(lowest < -(torch.finfo(H.dtype).eps ** 0.5), 1)
+        eigenvalues, vectors = torch.linalg.eigh(H / size / size.mT)
+        root = size * vectors * eigenvalues.clamp(min=0).sqrt().unsqueeze(-2)
         upper = torch.linalg.qr(root.mT).R
         sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0)
-        lower = upper.mT * sign.unsqueeze(-2)
-        if not n:
-            return lower
         factor = value.clone()
-        factor[..., :n, n:], factor[..., n:, n:] = 0, lower
+        factor[..., :n, n:], factor[..., n:, n:] = 0, upper.mT * sign.unsqueeze(-2)
         return factor
 
 
@@ -281,16 +286,6 @@ def _linear_rows(G: Tensor, layout: Layout) -> tuple[Tensor, Tensor]:
     mixed = layout.horizon * layout.n_mixed
     _, D, D_f = G.split((layout.n_z - layout.n_preview, mixed, layout.n_terminal))
     return D, D_f
-
-
-def _spectrum(H: Tensor) -> tuple[Tensor, Tensor]:
-    """Return eigenvalues and eigenvectors; raise `QPError` if H is not positive semidefinite."""
-    eigenvalues, vectors = torch.linalg.eigh((H + H.mT) / 2)
-    tolerance = 1e-5 if H.dtype == torch.float32 else 1e-9
-    if (eigenvalues < -tolerance * eigenvalues.abs().amax(-1, keepdim=True)).any():
-        got = f"smallest eigenvalue {eigenvalues.min():.3g}"
-        raise QPError.expected("H", got, "a positive semidefinite matrix")
-    return eigenvalues, vectors
 
 
 def _check_tied(name: str, entries: Tensor, tied: Tensor) -> None:

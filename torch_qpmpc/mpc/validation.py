@@ -148,7 +148,8 @@ def check_weight(name: str, weight: Tensor, diagonal: bool, n_d: int) -> None:
             got = f"asymmetry {asymmetry.max():.3g}"
             raise QPError.expected(name, got, "a symmetric matrix", "Pass (W + W.mT) / 2.")
     eigenvalues = weight if diagonal else torch.linalg.eigvalsh(weight[..., n_d:, n_d:])
-    if (eigenvalues < (0.0 if diagonal else -1e-9 * eigenvalues.abs().max())).any():
+    tolerance = 0.0 if diagonal else 1e-5 if weight.dtype == torch.float32 else 1e-9
+    if (eigenvalues < -tolerance * eigenvalues.abs().max()).any():
         got = f"smallest eigenvalue {eigenvalues.min():.3g}"
         remedy = "It weights a cost: negate a reward's weight."
         raise QPError.expected(name, got, "a positive semidefinite weight", remedy)
