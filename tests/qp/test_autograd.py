@@ -81,6 +81,17 @@ def test_gradient_is_that_of_the_lagrangian_at_the_solution(solver):
         )
 
 
+@pytest.mark.parametrize("of_action", [False, True])
+def test_gradient_in_state_and_action_agrees_with_finite_differences(of_action):
+    mpc, s, a = random_mpc(0), random_states(6), random_states(6, 1, size=0.4)
+    s.requires_grad_()
+    a.requires_grad_()
+    if of_action:
+        assert torch.autograd.gradcheck(mpc.action_value, (s, a), eps=1e-5, atol=1e-4)
+    else:
+        assert torch.autograd.gradcheck(mpc.value, (s,), eps=1e-5, atol=1e-4)
+
+
 def test_batch_dimensions_broadcast_in_value_and_gradient():
     K, B = 3, 4
     shapes = {"H": (K, 1), "q": (B,), "c": (K, 1), "C": (1, B), "b": (), "G": (), "w": (K, 1)}
