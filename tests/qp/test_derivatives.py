@@ -65,6 +65,18 @@ def test_shared_and_separate_matrices(matrices):
         assert_agrees_with_differences(operands_of(known), name, "z")
 
 
+def test_policy_gradient_in_the_state_on_and_off_the_bounds():
+    mpc, s = random_mpc(0), random_states(16, size=3.0)
+    action, bound = mpc.policy(s), mpc.ub[mpc.n_x]
+    assert torch.autograd.gradcheck(mpc.policy, (s.clone().requires_grad_(),), eps=1e-6, atol=1e-5)
+    pinned = action.abs() > bound - 1e-9
+    slope = vmap(jacrev(mpc.policy))(s).abs().sum(-1)
+    assert pinned.any()
+    assert (~pinned).any()
+    assert slope[pinned].max() < 1e-9
+    assert slope[~pinned].min() > 1e-6
+
+
 UNSTABLE = (3.0, 1.0, 15), (10.0, 1.0, 10), (3.65, 10.0, 15)
 
 
