@@ -3,8 +3,6 @@
 They cover types, shapes and plain numbers; reading a tensor's values would slow down every call.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from typing import Any

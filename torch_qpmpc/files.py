@@ -1,7 +1,5 @@
 """Files of tensors and plain values: written atomically, and read without running code."""
 
-from __future__ import annotations
-
 import io
 import os
 import zipfile

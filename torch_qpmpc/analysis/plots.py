@@ -1,7 +1,5 @@
 """Figures of a learned QP: its canonical form, and an episode with plans."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

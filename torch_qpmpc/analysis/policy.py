@@ -3,8 +3,6 @@
 With a preview, the state s is all that V fixes, p ``(n_p,)``.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """A report on the predictions and the policy of a QPMPC."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields

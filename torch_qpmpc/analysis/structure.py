@@ -11,8 +11,6 @@ x_k + ..``, as in an MPC scheme: for such a scheme it is C_0 (eq:cband). Norms a
 of the maps from (p, U) to the states, in the QP's units.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`Controller.export_c`: a controller as C, compared with Python in a closed loop."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ The candidate of `learn` has the new model in its observer, its target and its p
 with the same set-points and noise for both, decide (`torch_qpmpc.learning.gate.PairedTest`).
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

@@ -18,8 +18,6 @@ proximal point method, Rockafellar, SIAM J. Control Optim. 14, 1976). A weight s
 moves no output off r would cost numbers in C their digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

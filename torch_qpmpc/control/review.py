@@ -1,7 +1,5 @@
 """`Controller.review`: what is wrong with a design, in sentences, with a remedy for each fault."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Plants and environments; Gymnasium has the point mass as ``torch_qpmpc/PointMass-v0``."""
 
-from __future__ import annotations
-
 from torch_qpmpc.envs.gros_zanon import GrosZanonLTI
 from torch_qpmpc.envs.gymnasium_plant import GymnasiumPlant
 from torch_qpmpc.envs.kalman_filter import KalmanFilter

@@ -1,7 +1,5 @@
 """Closed-loop evaluation, with the same starts and noise for every policy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import singledispatch

@@ -6,8 +6,6 @@ From "Data-driven economic NMPC using reinforcement learning" (IEEE TAC 2020, ar
 package mpcrl uses it in its example of on-policy Q-learning.
 """
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """A Kalman filter as a TorchRL transform: its observation is the estimate of a model's state."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -7,8 +7,6 @@ ones d come first, then those that no controller sees, such as noise.
 `PlantEnv` is a plant's TorchRL environment.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self

@@ -3,8 +3,6 @@
 s+ = A s + B a + nu,    s = [x, y, vx, vy],    a = [F_x, F_y],    L(s, a) = s'Ws
 """
 
-from __future__ import annotations
-
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """TorchRL environments of vectorised episodes, whose only state is a random generator."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """The learner of train.py, made from the configuration: loss, actor, optimiser, penalties."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

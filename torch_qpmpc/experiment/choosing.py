@@ -1,7 +1,5 @@
 """The choice of a start: linear and nonlinear MPC of a log, beside zero action on the plant."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The gate of a run: the policies that act and that are kept, compared on the plant."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

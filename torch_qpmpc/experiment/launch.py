@@ -1,7 +1,5 @@
 """Launch of a run: its folder, its lock, its end by Ctrl-C, and its errors as one sentence."""
 
-from __future__ import annotations
-
 import logging
 import re
 import shlex

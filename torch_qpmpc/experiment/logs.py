@@ -1,7 +1,5 @@
 """Operations on a log of TorchRL: cut where it blows up, and filtered."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDictBase
 

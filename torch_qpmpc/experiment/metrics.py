@@ -1,7 +1,5 @@
 """A run's metrics and figures: per update, per evaluation, and in the summary."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Figures of a run: learning curve, constraint matrix, closed loop and one episode."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

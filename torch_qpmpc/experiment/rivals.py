@@ -4,8 +4,6 @@ The rival `IDENTIFICATION` of each task is made at the end of a run; see
 `torch_qpmpc.experiment.tasks.identified.nominal_mpcs`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

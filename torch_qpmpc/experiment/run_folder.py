@@ -1,7 +1,5 @@
 """A run's folder: config.yaml, metrics.csv, TensorBoard's files, checkpoint.pt, summary.json."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

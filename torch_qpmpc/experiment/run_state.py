@@ -4,8 +4,6 @@ Over a `LinearSystem` or a `Plant` the resumed run is exact, down to every rando
 environments cannot be saved and start new episodes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """``start=data``: the log that C and b are identified from, collected by exploration or loaded."""
 
-from __future__ import annotations
-
 import io
 from functools import partial
 from pathlib import Path

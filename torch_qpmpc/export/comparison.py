@@ -3,8 +3,6 @@
 Where policy and solver differ, the solution is refined in twice the working precision.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`export_c`: a policy as two files of C, checked against an exact solver; `CompiledPolicy`."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path

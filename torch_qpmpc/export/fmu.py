@@ -1,7 +1,5 @@
 """`export_fmu`: the C of a policy as an FMU, a component of Simulink, Modelica tools and FMPy."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 import sys

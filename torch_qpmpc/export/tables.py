@@ -8,8 +8,6 @@ and with it u_0 and the rows y = G z are affine in p and in the multipliers lam 
 and the dual problem is a QP in lam alone, with -w <= lam <= w. The rows are scaled to Q_ii = 1.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Write the C files of a policy: the template policy.c with the tables of one QP."""
 
-from __future__ import annotations
-
 import datetime
 import math
 import re

@@ -10,8 +10,6 @@ of state and outputs. For an innovations form, Q is zero, W = L R L' and N = L R
 covariance of its own state, which knows all earlier outputs, given those that there were.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Iterable
 from typing import Any, NamedTuple
 

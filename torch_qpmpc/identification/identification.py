@@ -3,8 +3,6 @@
 `torch_qpmpc.identification.subspace` has the mathematics.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from functools import cached_property

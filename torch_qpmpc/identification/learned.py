@@ -7,8 +7,6 @@ trained without a part of the log; the errors there choose between smooth and sh
 decide for each entry. Networks of what the linear model leaves are worse where the log is thin.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from typing import Any

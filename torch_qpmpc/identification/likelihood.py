@@ -1,7 +1,5 @@
 """Maximum likelihood of a linear model with noise, by expectation maximisation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 

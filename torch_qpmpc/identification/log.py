@@ -1,7 +1,5 @@
 """Trajectories of a plant with the names of their signals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

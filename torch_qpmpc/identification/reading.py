@@ -1,7 +1,5 @@
 """Logs from what a user has: tables, arrays, or steps of TorchRL."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

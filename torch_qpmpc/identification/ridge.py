@@ -1,7 +1,5 @@
 """Ridge regression in the units of the columns, with a strength that the data choose."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

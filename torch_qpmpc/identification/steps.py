@@ -1,7 +1,5 @@
 """Trajectories of steps as TorchRL's collectors and rollouts return them."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

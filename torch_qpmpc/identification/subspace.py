@@ -11,8 +11,6 @@ and of the distribution of x_0. Noise that has one source in w and v, or is dela
 states. Signals are normalised, so that units decide nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Logs of CSV files, DataFrames and arrays, and the faults of their columns."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """A gate: a learned policy is kept only once paired closed loops show that it costs less."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

@@ -3,8 +3,6 @@
 `torch_qpmpc.learning.kernel` has its program, the metric D on theta, and the dual that solves it.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping, Sequence

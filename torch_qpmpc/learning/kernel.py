@@ -32,8 +32,6 @@ stages, because a single entry of z may be nearly zero in a batch without being 
 Sizes and mean squares are entries of the optimiser's parameter groups, and so of its state.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

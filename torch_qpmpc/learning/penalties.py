@@ -4,8 +4,6 @@ Both are differentiable terms of a Q-learning loss; the deviation penalty also h
 step.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

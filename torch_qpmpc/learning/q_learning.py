@@ -1,7 +1,5 @@
 """Q-learning for a QP (eq:thup) as a TorchRL loss module."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ rows, so that neighbouring rows of a column are neighbouring steps of one enviro
 crosses a change of its column's trajectory id, or the ring buffer's seam.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

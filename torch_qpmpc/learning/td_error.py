@@ -1,7 +1,5 @@
 """TD errors of a batch: the usable pairs, their losses, weights and scalars that describe them."""
 
-from __future__ import annotations
-
 import warnings
 
 import torch

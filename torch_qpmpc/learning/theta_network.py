@@ -1,7 +1,5 @@
 """A network that moves theta with the observation: gain scheduling of the QP."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

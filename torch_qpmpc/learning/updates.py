@@ -6,8 +6,6 @@ step followed by `QPMPC.project_` (eq:sdp1) and the deviation penalty's proximal
 batch without a usable transition leaves theta and the optimiser's state unchanged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

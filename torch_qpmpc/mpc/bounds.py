@@ -1,7 +1,5 @@
 """The bounds of a scheme: the rows of G with lb, ub and the slack weights w (eq:v1c4)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from numbers import Real

@@ -1,7 +1,5 @@
 """The cost of a scheme (eq:qpH): the weights of the stages and of x_N, and q and c."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any

@@ -9,8 +9,6 @@ Without a preview it is the paper's z. G has one row for each entry of [x_0, u_0
 on (d_k, x_k, u_k) for each stage, then D^f on (d_N, x_N) (eq:v1c4).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The model of a scheme: x_{k+1} = A x_k + B u_k + E d_k + offset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -14,8 +14,6 @@ gradient of V, and the QP's KKT system that of the plan, with the Hessian of the
 curvature included, in place of H (Fiacco, 1976).
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace

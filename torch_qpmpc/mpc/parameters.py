@@ -6,8 +6,6 @@ stays positive semidefinite, w non-negative and a tied C a model. Other parts ar
 coordinates themselves.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import starmap

@@ -5,8 +5,6 @@ needs no semidefinite program (eq:sdp1). In a linear MPC scheme (eq:v1), C has o
 band, and the stages share their values.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -9,8 +9,6 @@ proposal without its negative eigenvalues, for each block of H. So ``"projection
 make the same step, and ``"cholesky"`` another, in the factor of H, which needs neither.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import ModuleType
 

@@ -1,7 +1,5 @@
 """A convex quadratic stage cost from observed costs, by least squares."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import dataclass, replace

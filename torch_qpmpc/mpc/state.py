@@ -4,8 +4,6 @@ The identity prevents loading a state into another module. torch does not pickle
 modules, but spawned collectors need it: a pickle has the scheme and the state.
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from dataclasses import asdict

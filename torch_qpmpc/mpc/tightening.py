@@ -14,8 +14,6 @@ References:
     constraints - a review" (Journal of Process Control 44, 2016), section 3.
 """
 
-from __future__ import annotations
-
 import torch
 from scipy.special import ndtri
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Checks of the arguments and inputs of `QPMPC`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from functools import wraps
 from inspect import signature

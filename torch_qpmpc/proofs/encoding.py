@@ -12,8 +12,6 @@ Reference: the encoding is that of Schwan, Jones and Kuhn (2023), "Stability ver
 network controllers using mixed-integer programming", IEEE TAC, for multi-parametric QPs.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -12,8 +12,6 @@ Mathematical Problems in Engineering 4; saturated, Hu, Lin and Chen (2002), Syst
 Letters 45.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Questions about a policy on a set of states, each answered by a proof or a counterexample."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

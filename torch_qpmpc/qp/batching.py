@@ -1,7 +1,5 @@
 """Batch dimensions: alignment under vmap, products, sums in gradients."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -34,8 +34,6 @@ one-sided one for changes that move z off its bound. A row at the kink |lam| = w
 saturated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import torch

@@ -3,8 +3,6 @@
 `torch_qpmpc.qp.derivatives` has its formula.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -12,8 +12,6 @@ upsilon'(lb - sigma - Gz) + eta'(Gz - ub - sigma) - mu'sigma; the paper prints t
 A row with w_i = inf is hard: its sigma_i is zero.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass

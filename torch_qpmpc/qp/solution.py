@@ -1,7 +1,5 @@
 """The solution of a batch of QPs, and its active set."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ compile, fake tensors, forward mode) are one custom operator over the same pipel
 and a Function around it that is differentiable under `torch.func` and in forward mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -4,8 +4,6 @@ The solver must be hidden from traces and transforms, which torch has no public 
 test of each function fails if torch changes the internals that it reads.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext

@@ -1,7 +1,5 @@
 """Figures of many finished runs: learning curves, learned matrices and model errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from matplotlib import colormaps

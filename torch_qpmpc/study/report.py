@@ -5,8 +5,6 @@ intervals or ranges over seeds (1 and 3: learning-NOISE.png, 2 and 4: constraint
 the errors of the models that are read from C.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ A run's folder is data: no code that its configuration names is run. All reading
 independent of its gauge.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Robust averages over seeds, with their confidence intervals, or the ranges of a few values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

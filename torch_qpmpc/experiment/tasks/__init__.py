@@ -3,8 +3,6 @@
 Each task is one file that registers it. A user's script can register more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any

@@ -3,8 +3,6 @@
 A configuration from a run's folder is data: its code runs only if the command line names it, too.
 """
 
-from __future__ import annotations
-
 import importlib
 import runpy
 import sys

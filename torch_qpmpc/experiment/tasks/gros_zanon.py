@@ -1,7 +1,5 @@
 """``task=gros_zanon``: Gros and Zanon's linear system, learned from their wrong model."""
 
-from __future__ import annotations
-
 import torch
 
 from torch_qpmpc.envs import GrosZanonLTI

@@ -1,7 +1,5 @@
 """``task=gymnasium``: any Gymnasium environment, learned from a linear model of it."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """``task=point_mass``: the paper's plant, learned from a corrupted model and a random cost."""
 
-from __future__ import annotations
-
 import torch
 
 from torch_qpmpc.envs import PointMass

@@ -13,8 +13,6 @@ theta changes little, and most active sets stay the same. The same Cholesky fact
 of K solves the linear KKT system of the derivatives.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Batched linear algebra in torch, on the device of its tensors."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -12,8 +12,6 @@ level) for so many steps, leaves each decision only levels that some sequence al
 least cost of starts to the node's bound.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from torch_qpmpc.qp.kernels.active_set import solve

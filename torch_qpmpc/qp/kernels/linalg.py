@@ -3,8 +3,6 @@
 The second half runs once for each theta. LAPACK and NumPy take several times as long.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import suppress

@@ -28,8 +28,6 @@ the sum of ``|Hz + q| (ub - lb)`` over the entries with hard bounds, by which th
 first order, between these bounds. Where the cost is zero, its errors are small beside the swing.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 from typing import Any, NamedTuple

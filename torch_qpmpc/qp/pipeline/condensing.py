@@ -5,8 +5,6 @@ solution of C z = b is ``z = z_0 + T y``. All samples of a batch, and V, Q and t
 T'HT and GT; fixing the first n_f <= n_kept entries then only changes the linear cost and bounds.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

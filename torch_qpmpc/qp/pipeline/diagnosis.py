@@ -13,8 +13,6 @@ chapter 23), in an orthonormal basis of the null space of C, which is accurate e
 elimination is ill-conditioned.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy  # imports scipy.optimize at its first use: a third of a second
 

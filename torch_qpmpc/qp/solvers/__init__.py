@@ -4,8 +4,6 @@ A backend is a function ``solve(qps: SoftQPs) -> BackendSolution`` of QPs with a
 add one, write its file and list it in `BACKENDS`.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable
 from functools import partial

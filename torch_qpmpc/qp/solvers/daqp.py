@@ -4,8 +4,6 @@ Of a batch it solves what `torch_qpmpc.qp.kernels.active_set`, a method of the s
 DAQP's call for each QP, leaves unsolved.
 """
 
-from __future__ import annotations
-
 import daqp
 import numpy as np
 

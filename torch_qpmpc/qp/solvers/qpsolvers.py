@@ -1,7 +1,5 @@
 """Any solver of the `qpsolvers` package, ``solver="qpsolvers:NAME"``, on the split-slack form."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy  # imports scipy.sparse at its first use
 
