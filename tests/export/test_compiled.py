@@ -166,6 +166,18 @@ def test_the_compiler_is_the_first_of_cc_gcc_clang_and_ziglang(monkeypatch):
     assert library.compiler() == ["gcc", "-m32"]
 
 
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [("  ", "none on the PATH, expected"), ("'/my cc' -m32", "'/my cc' does not")],
+)
+def test_cc_may_be_blank_or_quoted(monkeypatch, command, said):
+    monkeypatch.setattr(library.shutil, "which", lambda _: None)
+    monkeypatch.setattr(library.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setenv("CC", command)
+    with pytest.raises(QPError, match=said):
+        library.required_compiler()
+
+
 @needs_compiler
 def test_an_error_of_the_compiler_is_named():
     with pytest.raises(QPError, match=r"(?s)compiler: got an error of .*expected a compiled"):

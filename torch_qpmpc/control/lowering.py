@@ -145,10 +145,8 @@ def _slope(design: Design, P: Array) -> tuple[Array, Array]:
         L = L + P @ (np.vstack(maps)[: len(P)] @ to_r / sizes[:, None])
     size_r = of_y[of_r]
     if design.pulls[1].size:
-        L, size_r = (
-            np.hstack((L, np.pad(right, ((0, len(L) - len(A)), (0, 0))))),
-            np.tile(size_r, 2),
-        )
+        at_end = np.pad(right, ((0, len(L) - len(A)), (0, 0)))
+        L, size_r = np.hstack((L, at_end)), np.tile(size_r, 2)
     values, V = np.linalg.eigh(P)
     values, V = values[costly := values > TINY * values[-1]], V[:, costly]
     own = V.T @ L / np.sqrt(values)[:, None]  # a slope without a cost would have no least value

@@ -57,9 +57,19 @@ def tightened(plant: LinearSystem, weight: Tensor, W: Tensor, walk: bool = False
         W = W.repeat(2, 2)
     covariances = prediction_covariance(closed, W, HORIZON, initial)
     mpc = QPMPC.from_model(
-        A, B, HORIZON, gamma=1.0, offset=offset, hessian="block", stage_weight=weight,
-        terminal_weight="riccati", state_bounds=(plant.lb_s, plant.ub_s), state_slack=SLACK,
-        action_bounds=(plant.lb_a, plant.ub_a), learn=(), solver="daqp",
-    )  # fmt: skip
+        A,
+        B,
+        HORIZON,
+        gamma=1.0,
+        offset=offset,
+        hessian="block",
+        stage_weight=weight,
+        terminal_weight="riccati",
+        state_bounds=(plant.lb_s, plant.ub_s),
+        state_slack=SLACK,
+        action_bounds=(plant.lb_a, plant.ub_a),
+        learn=(),
+        solver="daqp",
+    )
     tighten(mpc, covariances[:, :n_x, :n_x], K=K)
     return mpc.policy

@@ -47,8 +47,8 @@ def required_compiler() -> list[str]:
     """
     if (command := compiler()) is None:
         got, remedy = "none on the PATH", "Install one, or pip install ziglang, which has clang."
-        if named := os.environ.get("CC"):
-            remedy += f" $CC is {named!r}; {named.split()[0]!r} does not exist: unset it."
+        if named := shlex.split(os.environ.get("CC", "")):
+            remedy += f" $CC is {' '.join(named)!r}; {named[0]!r} does not exist: unset it."
         raise QPError.expected("compiler", got, "a C compiler: $CC, cc, gcc or clang", remedy)
     return command
 

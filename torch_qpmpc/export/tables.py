@@ -150,14 +150,29 @@ def make_tables(mpc: QPMPC) -> Tables:
         places = (x.astype(np.int8) for x in levels.within(lb, ub))
         decisions |= dict(zip(("FIRST", "LAST"), places, strict=True))
     return Tables(
-        n_p=n_p, n_u=n_u, rows=rows, places=on_plan, known=known, Q=R @ R.T, R=R,
-        K=of_u[:, None] * Z[u], k=of_u * z_0[u],
+        n_p=n_p,
+        n_u=n_u,
+        rows=rows,
+        places=on_plan,
+        known=known,
+        Q=R @ R.T,
+        R=R,
+        K=of_u[:, None] * Z[u],
+        k=of_u * z_0[u],
         F=of_u[:, None] * np.linalg.solve(factor, T_v[u].T).T @ R.T,
-        P=Z.T @ H @ Z, g=Z.T @ (H @ z_0 + q), c=float(c + (q + H @ z_0 / 2) @ z_0),
-        u_lower=u_lower, u_upper=u_upper, condition=condition,
-        centre=_centre(qp, n_p, mpc.scheme.constants), usual=np.where(own > 0, own, 1.0) ** -0.5,
-        constants=mpc.scheme.constants, levels=levels, decisions=decisions, digest=digest(qp),
-    )  # fmt: skip
+        P=Z.T @ H @ Z,
+        g=Z.T @ (H @ z_0 + q),
+        c=float(c + (q + H @ z_0 / 2) @ z_0),
+        u_lower=u_lower,
+        u_upper=u_upper,
+        condition=condition,
+        centre=_centre(qp, n_p, mpc.scheme.constants),
+        usual=np.where(own > 0, own, 1.0) ** -0.5,
+        constants=mpc.scheme.constants,
+        levels=levels,
+        decisions=decisions,
+        digest=digest(qp),
+    )
 
 
 def _check(qp: QuadraticProgram) -> None:

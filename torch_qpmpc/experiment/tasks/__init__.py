@@ -73,6 +73,11 @@ def _make(cfg: Config, scheme: Scheme, learn: Collection[str], **options: Any) -
         weight = choice if choice == "riccati" else [1.0] * scheme.layout.n_x
         scheme = replace(scheme, cost=replace(scheme.cost, terminal_weight=weight))
     return QPMPC(
-        scheme, learn=learn, structure=cfg.constraint.structure, step=cfg.step, solver=cfg.solver,
-        on_failure="mask", **options,
-    )  # fmt: skip
+        scheme,
+        learn=learn,
+        structure=cfg.constraint.structure,
+        step=cfg.step,
+        solver=cfg.solver,
+        on_failure="mask",
+        **options,
+    )
